@@ -73,6 +73,7 @@ from semcal_ros.core.calibration.stage import (
 from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start, with_excess
 from semcal_ros.core.calibration.untilted import look_untilted, mark_untilted
 from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
+from semcal_ros.core.corners.detection import MINIMUM_CORNERS
 from semcal_ros.core.errors import (
     CalibrationError,
     InvalidValueError,
@@ -83,8 +84,6 @@ from semcal_ros.core.wording import counted
 
 __all__ = ["FEWEST_VIEWS", "are_enough", "calibrate_views", "fit_joint"]
 
-# Twice as many as determine a homography, so that there are residuals to judge a view by.
-_MIN_CORNERS = 8
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
 FEWEST_VIEWS = 3
 # Display widths and squares that are stated are right to some per cent, and tilts shorten lengths by as much.
@@ -205,10 +204,10 @@ def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tupl
             do="add tilted views, or say that the grid was not tilted (--untilted all)",
         )
     for view in views:
-        if (count := len(view.board_xy_m)) < _MIN_CORNERS:
+        if (count := len(view.board_xy_m)) < MINIMUM_CORNERS:
             raise CalibrationError(
                 f"view {view.name} with {counted(count, 'corner')}",
-                expected=f"at least {_MIN_CORNERS} in every view",
+                expected=f"at least {MINIMUM_CORNERS} in every view",
                 do="leave this view out",
             )
     return tuple(sorted(views, key=lambda v: v.magnification))

@@ -39,7 +39,7 @@ from semcal_ros.core.corners.dots_and_lines import (
     refine_cells,
     split_mixture,
 )
-from semcal_ros.core.corners.lattice import Lattice
+from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
 from semcal_ros.core.corners.neighbour_consistency import estimate_scatter_px
@@ -381,11 +381,10 @@ def _refine(
         points = refine_cells(image, candidate.cells.reduced(factor), shape)
     if points is None or octave == 0:
         return points
-    # Pixel centres of the reduced picture lie in the middle of the pixels that they replace.
     return replace(
         points,
-        xy=factor * (points.xy + 0.5) - 0.5,
-        rejected_xy=factor * (points.rejected_xy + 0.5) - 0.5,
+        xy=enlarged(points.xy, factor),
+        rejected_xy=enlarged(points.rejected_xy, factor),
         covariance=factor**2 * points.covariance,
         blur_px=factor * points.blur_px,
     )

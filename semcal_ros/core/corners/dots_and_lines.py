@@ -38,7 +38,7 @@ from semcal_ros.core.corners.checks import (
     select_connected,
 )
 from semcal_ros.core.corners.corner_fit import NoiseModel, fit_noise
-from semcal_ros.core.corners.lattice import STEPS, Lattice, grow_best_lattice
+from semcal_ros.core.corners.lattice import STEPS, Lattice, enlarged, grow_best_lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.neighbour_consistency import find_consistent
@@ -109,10 +109,7 @@ def grow_at_scale(
     """
     factor = 2.0**octave
     saddles = find_saddles(small, scale_px / factor)
-    # Pixel centres of the reduced image lie in the middle of the pixels that they replace.
-    moved = SaddlePoints(
-        factor * saddles.xy + 0.5 * (factor - 1.0), saddles.hessian, saddles.response
-    )
+    moved = SaddlePoints(enlarged(saddles.xy, factor), saddles.hessian, saddles.response)
     lattice = grow_best_lattice(moved, size)
     if lattice is None:
         return None

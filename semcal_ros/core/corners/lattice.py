@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.corners.saddle import SaddlePoints
 
-__all__ = ["Lattice", "grow_best_lattice"]
+__all__ = ["Lattice", "enlarged", "grow_best_lattice"]
 
 
 # Nearest saddle points among which the four neighbours of a seed are looked for: the first four
@@ -76,7 +76,15 @@ class Lattice:
 
     def reduced(self, factor: float) -> Lattice:
         """Return the lattice in an image whose pixels are so many times as large."""
-        return Lattice(self.ij, (self.xy + 0.5) / factor - 0.5, self.axes / factor)
+        return Lattice(self.ij, enlarged(self.xy, 1.0 / factor), self.axes / factor)
+
+
+def enlarged(xy: Array, factor: float) -> Array:
+    """Return positions in the whole image of those in one whose pixels are so many times as large.
+
+    Pixel centres of the reduced image lie in the middle of the pixels that they replace.
+    """
+    return factor * (xy + 0.5) - 0.5
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@
 
 All of them repeat on a square lattice, and a chess board is a lattice of squares that touch at their
 corners. What differs is the shape of the bright part: a square on its tip (chess), a disc (dots,
-holes), a plus sign (crosses), or a square in line with the lattice (the opening between crossed lines).
-Its transform is
-known in closed form; size and blur are fitted for each shape, and the best fit names the pattern.
+holes), a plus sign (crosses), or a square in line with the lattice (the opening between crossed
+lines). Its transform is known in closed form; size and blur are fitted for each shape, and the best
+fit names the pattern.
 """
 
 from __future__ import annotations

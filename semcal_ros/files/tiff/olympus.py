@@ -26,6 +26,7 @@ from typing import Any
 
 from semcal_ros.files.tiff.sem_image import VendorSettings
 from semcal_ros.files.tiff.values import (
+    aspect_notes,
     check_pixel_size,
     is_credible_year,
     plain_number,
@@ -36,7 +37,6 @@ __all__ = ["TAG", "olympus_settings"]
 
 # OlympusSIS.
 TAG = 33560
-_SQUARE_TOLERANCE = 1e-3
 
 
 def olympus_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
@@ -50,9 +50,6 @@ def olympus_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
     width, height = tag.get("pixelsizex"), tag.get("pixelsizey")
     pixel_m = check_pixel_size(path, plain_number(width), "pixelsizex in tag 33560 (SIS)", width)
     pixel_y_m = check_pixel_size(path, plain_number(height) or pixel_m, "pixelsizey", height)
-    notes = []
-    if abs(pixel_y_m / pixel_m - 1.0) > _SQUARE_TOLERANCE:
-        notes.append(f"pixels are not square: {pixel_m:g} m wide, {pixel_y_m:g} m high")
     date = tag.get("datetime")
     return VendorSettings(
         maker="olympus",
@@ -61,5 +58,5 @@ def olympus_settings(path: Path, tag: Mapping[str, Any]) -> VendorSettings:
         displayed_magnification=positive(plain_number(tag.get("magnification"))),
         detector=str(tag.get("cameraname", "")).strip(),
         time=date if isinstance(date, datetime) and is_credible_year(date.year) else None,
-        notes=tuple(notes),
+        notes=tuple(aspect_notes(pixel_m, pixel_y_m)),
     )

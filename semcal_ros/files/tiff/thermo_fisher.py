@@ -30,6 +30,7 @@ from xml.etree import ElementTree
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.sem_image import VendorSettings
 from semcal_ros.files.tiff.values import (
+    aspect_notes,
     check_pixel_size,
     first_date,
     plain_number,
@@ -50,8 +51,6 @@ __all__ = [
 TAGS = (34682, 34680)
 ROOT = "Metadata"
 _BEAMS = {"EBeam": "electron", "IBeam": "ion", "Electron": "electron", "Ion": "ion"}
-# Beyond it a note says that pixels are not square; both sizes are used unchanged in any case.
-_SQUARE_TOLERANCE = 1e-3
 
 
 def thermo_fisher_sections(text: str) -> dict[str, dict[str, str]]:
@@ -193,8 +192,7 @@ def thermo_fisher_settings(
     pixel_y_m = plain_number(scan.get("PixelHeight", common.get("PixelHeight"))) or pixel_m
     check_pixel_size(path, pixel_y_m, "PixelHeight", pixel_y_m)
     magnification, notes = _magnification(tag, pixel_m * size_px[0])
-    if abs(pixel_y_m / pixel_m - 1.0) > _SQUARE_TOLERANCE:
-        notes.append(f"pixels are not square: {pixel_m:g} m wide, {pixel_y_m:g} m high")
+    notes += aspect_notes(pixel_m, pixel_y_m)
     image, voltage = _section(tag, "Image"), plain_number(beam.get("HV"))
     if str(beam.get("TiltCorrectionIsOn", "")).lower() in ("yes", "true", "on"):
         notes.append(tilt_correction_note(plain_number(beam.get("TiltCorrectionAngle"))))
@@ -241,9 +239,7 @@ def thermo_fisher_xml_settings(
     pixel_m = check_pixel_size(path, quantity_of(root, x, "m"), x, root.findtext(x))
     pixel_y_m = quantity_of(root, y, "m") or pixel_m
     check_pixel_size(path, pixel_y_m, y, root.findtext(y))
-    notes = []
-    if abs(pixel_y_m / pixel_m - 1.0) > _SQUARE_TOLERANCE:
-        notes.append(f"pixels are not square: {pixel_m:g} m wide, {pixel_y_m:g} m high")
+    notes = aspect_notes(pixel_m, pixel_y_m)
     if text_of(root, "Optics/SampleTiltCorrectionOn").lower() == "true":
         notes.append(tilt_correction_note(number_of(root, "Optics/SampleTiltCorrectionAngle")))
     voltage_v = number_of(root, "Optics/AccelerationVoltage")

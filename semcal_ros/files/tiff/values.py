@@ -26,6 +26,7 @@ from semcal_ros.core.errors import TiffError
 __all__ = [
     "PIXEL_SIZE_RANGE_M",
     "angle_in_degrees",
+    "aspect_notes",
     "check_pixel_size",
     "duration",
     "first_date",
@@ -40,6 +41,8 @@ __all__ = [
 # A tenth of a picometre lies far below the size of an atom, a millimetre above any field of an SEM
 # divided by its columns: what lies outside has lost its unit.
 PIXEL_SIZE_RANGE_M = (1e-13, 1e-3)
+# Relative difference of the sizes of a pixel beyond which a note says that it is not square.
+_SQUARE_TOLERANCE = 1e-3
 _YEARS = (1971, 2037)  # what the 32-bit seconds of a ROS stamp hold
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -166,6 +169,13 @@ def first_date(candidates: list[tuple[str, str]]) -> datetime | None:
         if is_credible_year(found.year):
             return found
     return None
+
+
+def aspect_notes(pixel_m: float, pixel_y_m: float) -> list[str]:
+    """Return a remark if pixels are not square; both sizes are used unchanged in any case."""
+    if abs(pixel_y_m / pixel_m - 1.0) <= _SQUARE_TOLERANCE:
+        return []
+    return [f"pixels are not square: {pixel_m:g} m wide, {pixel_y_m:g} m high"]
 
 
 def tilt_correction_note(angle_rad: float | None) -> str:
