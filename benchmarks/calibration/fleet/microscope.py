@@ -32,6 +32,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.calibration.draws import Draws
+
 Array = NDArray[np.float64]
 
 DISPLAY_WIDTH_M = 0.12
@@ -201,15 +203,8 @@ class SeenGrid:
 def draw_microscope(seed: int, index: int) -> Microscope:
     """The microscope of this index in the fleet of this seed."""
     rng = np.random.default_rng((seed, index, 0))
-
-    def between(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
-
-    def ratio(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-    def either(part: float) -> bool:
-        return bool(rng.uniform() < part)
+    draws = Draws(rng)
+    between, ratio, either = draws.between, draws.ratio, draws.either
 
     width = round(ratio(384, 6144) / 4.0) * 4
     height = width if either(0.5) else round(0.75 * width)

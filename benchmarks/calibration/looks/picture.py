@@ -38,6 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from benchmarks.calibration.draws import Draws
+
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Flags = NDArray[np.bool_]
@@ -474,15 +476,8 @@ _SHAPES: Mapping[str, Callable[[Look, _Layout, Array, Array], Distances]] = {
 def draw_look(seed: int, index: int) -> Look:
     """The look of this index in the collection of this seed."""
     rng = np.random.default_rng((seed, index, 0))
-
-    def between(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
-
-    def ratio(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-    def either(part: float) -> bool:
-        return bool(rng.uniform() < part)
+    draws = Draws(rng)
+    between, ratio, either = draws.between, draws.ratio, draws.either
 
     kind = str(rng.choice(KINDS))
     width = round(ratio(LEAST_WIDTH, LARGEST_WIDTH) / 4.0) * 4
