@@ -278,6 +278,17 @@ class Problem:
         return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
 
     @cached_property
+    def points_on_squares(self) -> dict[str, Mask]:
+        """The unknowns of sizes of squares, and for each the (N,) points on squares of that size."""
+        out = {}
+        for name in self.shared:
+            if name.startswith("square_"):
+                assert self.square_class is not None
+                own = self.square_class == int(name.removeprefix("square_"))
+                out[name] = own[self.view_of_point]
+        return out
+
+    @cached_property
     def parameter_index(self) -> Indices:
         """(P,) place of each of ``parameters`` among those of a camera."""
         return np.array([ALL_NAMES.index(name) for name in self.parameters], dtype=np.intp)

@@ -185,20 +185,9 @@ def _shaped_grid(problem: Problem, state: State) -> Array:
 def _square_sizes(problem: Problem, state: State) -> Array:
     """Return the (N,) factors by which the squares are larger than stated."""
     size = np.ones(len(problem.board_m))
-    for name, shown in _square_classes(problem).items():
+    for name, shown in problem.points_on_squares.items():
         size += shown * problem.shared_values(state.theta, [name])
     return size
-
-
-def _square_classes(problem: Problem) -> dict[str, Array]:
-    """Return the unknowns of sizes of squares, and for each the (N,) points on squares of that size."""
-    out = {}
-    for name in problem.shared:
-        if name.startswith("square_"):
-            assert problem.square_class is not None
-            own = problem.square_class == int(name.removeprefix("square_"))
-            out[name] = own[problem.view_of_point]
-    return out
 
 
 def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, Array]:
@@ -307,7 +296,12 @@ class _CornerDerivatives:
         """(2, 3, N) by the points of the grid before their squares grow, in its axes."""
         rotations = self.state.rotations[self.problem.view_of_point]
         by_point = np.einsum("kin,nij->kjn", self.by_point, rotations)
-        return np.asarray(by_point * _square_sizes(self.problem, self.state))
+        return np.asarray(by_point * self.square_sizes)
+
+    @cached_property
+    def square_sizes(self) -> Array:
+        """(N,) factors by which the squares are larger than stated."""
+        return _square_sizes(self.problem, self.state)
 
     def by_camera(self) -> Array:
         """By the parameters of the camera."""
@@ -323,8 +317,9 @@ class _CornerDerivatives:
         """By the relative sizes of the squares."""
         grid = _shaped_grid(self.problem, self.state)
         along = np.einsum("kjn,nj->kn", self.by_grid_point, grid)
-        along = along / _square_sizes(self.problem, self.state) ** 2
-        return np.stack([along * shown for shown in _square_classes(self.problem).values()], axis=1)
+        along = along / self.square_sizes**2
+        shown = self.problem.points_on_squares.values()
+        return np.stack([along * points for points in shown], axis=1)
 
     def by_visit_scale(self) -> Array:
         """By the relative scale of the visit: that of the camera, in other units."""
