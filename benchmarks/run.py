@@ -35,7 +35,8 @@ start_up     commands and nodes before they do anything, beside the import of nu
 
 Not among these: ``python -m benchmarks.drift.soak``, 20 000 frames out and back,
 ``python -m benchmarks.drift.turning``, frames that turn or grow, and
-``python -m benchmarks.calibration.fleet``, random microscopes that a calibration has to hold on.
+``python -m benchmarks.calibration.fleet``, random microscopes that a calibration has to hold on, and
+``python -m benchmarks.calibration.looks``, random pictures of grids that have to be found.
 
 Everything but one column is measured on simulated data whose truth is known, with fixed seeds.
 Accuracy is in px and stands beside a bound wherever there is one. A time is the ratio of two
