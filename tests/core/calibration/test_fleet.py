@@ -21,15 +21,19 @@ import pytest
 from benchmarks.calibration.fleet.score import judge
 from tests.helpers.long_tests import long_but
 
-# What each of them did before the fit started from corners that are as uncertain as the model: 4, 11 and 18 have strong
-# spirals, coils or settling, or a pivot 4 mm away; 5 ended with the pivot on the wrong side, 3 left out sound views.
-CASES = long_but(lambda index: index == 4, (3, 4, 5, 10, 11, 13, 18))
+# Seed and index. What each of them did before the fit started from corners that are as uncertain as the model: of
+# seed 1, 4, 11 and 18 have strong spirals, coils or settling, or a pivot 4 mm away; 5 ended with the pivot on the wrong
+# side, 3 left out sound views. Of seed 0, the drift that all views share ran away, and the aspect ratio with it.
+CASES = long_but(
+    lambda case: case == (1, 4),
+    ((1, 3), (1, 4), (1, 5), (1, 10), (1, 11), (1, 13), (1, 18), (0, 25), (0, 214)),
+)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("index", CASES)
-def test_a_random_microscope_is_calibrated_within_what_is_stated(index: int) -> None:
-    outcome, trace = judge(1, index)
+@pytest.mark.parametrize("case", CASES)
+def test_a_random_microscope_is_calibrated_within_what_is_stated(case: tuple[int, int]) -> None:
+    outcome, trace = judge(*case)
     assert (outcome.raised, outcome.numpy_warnings) == ("", ()), trace
     assert outcome.verdict == "fine"
     assert outcome.views_left_out == 0

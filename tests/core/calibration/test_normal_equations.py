@@ -212,6 +212,21 @@ def test_covariances_are_those_of_the_whole_system(system, dense):
         spread = take @ inverse @ take.T
         expected = np.diag(rows[v] @ spread @ rows[v].T)
         np.testing.assert_allclose(found[v], expected, rtol=5e-3, atol=1e-6)
+    at = problem.layout.of_view["view.drift"]
+    for j in range(len(state.visits)):
+        members = np.flatnonzero(problem.effects.visit == j)
+        mean = np.zeros((2, len(inverse)))
+        for v in members:
+            own = (
+                size
+                + state.visits.size
+                + problem.layout.of_view.size * v
+                + np.arange(at.start, at.stop)
+            )
+            mean[[0, 1], own] = 1.0 / len(members)
+        np.testing.assert_allclose(
+            result.mean_drift_variance[j], np.diag(mean @ inverse @ mean.T), rtol=5e-3
+        )
 
 
 # Steps in the units of the blocks, small against their curvature and large against rounding.

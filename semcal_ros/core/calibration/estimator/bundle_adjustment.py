@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -43,6 +43,7 @@ from semcal_ros.core.calibration.estimator.normal_equations import (
     normal_equations,
     reduced_normal_equations,
     schur_complement,
+    sum_by,
 )
 from semcal_ros.core.calibration.estimator.residuals import (
     prior_cost,
@@ -107,6 +108,8 @@ class BundleResult:
         (J, 2) posterior variance of the scale and of the height in m2 of each visit.
     iterations, status
         Number of steps, and why there were no more.
+    mean_drift_variance
+        (J, 2) posterior variance of the mean drift of the views of each visit, px2.
     last_decrease
         Relative decrease of the cost in the last step.
     """
@@ -123,6 +126,7 @@ class BundleResult:
     visit_variance: Array
     iterations: int
     status: DescentStatus
+    mean_drift_variance: Array = field(default_factory=lambda: np.zeros((0, 2)))
     last_decrease: float = 0.0
 
     @property
@@ -332,6 +336,7 @@ def _make_result(
         return _make_singular_result(problem, state, normal, cost, iterations)
     covariance = 0.5 * (covariance + covariance.T)
     visit_variance, view_covariance = _posterior(problem, reduced, covariance)
+    mean_drift = _mean_drift_variance(problem, reduced, view_covariance)
     known = view_residuals(problem, state)
     variance = {}
     for name, residual in known.items():
@@ -350,7 +355,28 @@ def _make_result(
         visit_variance=visit_variance,
         iterations=iterations,
         status=status,
+        mean_drift_variance=mean_drift,
         last_decrease=last_decrease,
+    )
+
+
+def _mean_drift_variance(problem: Problem, reduced: Eliminated, views: Array) -> Array:
+    """Return the (J, 2) posterior variance of the mean drift of the views of each visit.
+
+    The drift of a view is what is its own, and what follows from the unknowns of its visit, which the others share.
+    """
+    if problem.effects is None:
+        return np.zeros((0, 2))
+    visit, own = problem.effects.visit, problem.layout.of_view["view.drift"]
+    outer = problem.layout.view.start
+    count = np.bincount(visit)
+    by_rest = sum_by(visit, len(count), reduced.pose_by_rest[:, own]) / count[:, None, None]
+    # The views of a visit have the same covariance of what they share.
+    shared = views[np.unique(visit, return_index=True)[1], :outer, :outer]
+    single = np.diagonal(reduced.pose_inverse[:, own, own], axis1=1, axis2=2)
+    return np.asarray(
+        np.einsum("jap,jpq,jaq->ja", by_rest, shared, by_rest, optimize=True)
+        + sum_by(visit, len(count), single) / count[:, None] ** 2
     )
 
 
@@ -398,6 +424,7 @@ def _make_singular_result(
         prior_residuals={name: residual.values for name, residual in known.items()},
         prior_variance={name: np.ones(r.values.shape) for name, r in known.items()},
         visit_variance=np.full(state.visits.shape, np.inf),
+        mean_drift_variance=np.zeros(state.visits.shape),
         iterations=iterations,
         status=DescentStatus.SINGULAR,
     )

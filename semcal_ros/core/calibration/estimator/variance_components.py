@@ -222,14 +222,22 @@ def _drift_sigma(problem: Problem, result: BundleResult, usual: float) -> Array:
     """Fit the squares of the drifts by a constant and a part that grows with the scale.
 
     A drift of the specimen is one in metres, that of the beam one in pixels. An effect that the
-    data determine to ``1 - variance`` has so much of its variance as expected square.
+    data determine to ``1 - variance`` has so much of its variance as expected square. The drift that
+    the views of a visit share does not count: nothing tells it from the aspect ratio and the skew, so
+    that it would widen its own prior.
     """
     assert problem.effects is not None
-    sigma = problem.effects.drift_sigma_px
+    sigma, visit = problem.effects.drift_sigma_px, problem.effects.visit
+    drift = sigma[:, None] * result.prior_residuals["drift"]
+    count = np.bincount(visit)
+    mean = np.stack([np.bincount(visit, weights=d) for d in drift.T], axis=1) / count[:, None]
+    drift = drift - mean[visit]
     scale = np.min(problem.unit_m) / problem.unit_m
     design = np.stack([np.ones_like(scale), scale**2], axis=1)
-    determined = np.sum(np.maximum(1.0 - result.prior_variance["drift"], 0.0), axis=1)
-    square = sigma**2 * np.sum(result.prior_residuals["drift"] ** 2, axis=1)
+    # Of the deviations from the mean, as much of the prior variance as the posterior does not leave.
+    left = result.prior_variance["drift"] - result.mean_drift_variance[visit] / sigma[:, None] ** 2
+    determined = np.sum(np.maximum(1.0 - 1.0 / count[visit, None] - left, 0.0), axis=1)
+    square = np.sum(drift**2, axis=1)
     # The weights are those of chi-squares of the spread before, with as many degrees of freedom as
     # are determined; the last row is the usual one.
     root, known = np.sqrt(np.maximum(determined, 1e-6)), np.sqrt(_WEIGHT_OF_USUAL)

@@ -1,0 +1,79 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Spreads that are estimated with the rest, from what differs and not from what is common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.variance_components import _drift_sigma
+
+USUAL_PX = 0.1
+VISITS = np.repeat([0, 1, 2], 5)
+
+
+@dataclass(frozen=True)
+class _Effects:
+    drift_sigma_px: Array
+    visit: Array
+
+
+@dataclass(frozen=True)
+class _Problem:
+    effects: _Effects
+    unit_m: Array
+
+
+@dataclass(frozen=True)
+class _Result:
+    prior_residuals: dict[str, Array]
+    prior_variance: dict[str, Array]
+    mean_drift_variance: Array
+
+
+def estimated(drift_px: Array, sigma_px: float) -> float:
+    """The spread after one update from ``sigma_px``, where the views determine all drifts but the common one."""
+    sigma = np.full(len(VISITS), sigma_px)
+    problem = _Problem(_Effects(sigma, VISITS), np.full(len(VISITS), 1e-8))
+    # Of five views, nothing is known of the mean, a fifth of the variance, and all of the rest.
+    result = _Result(
+        {"drift": -drift_px / sigma_px},
+        {"drift": np.full(drift_px.shape, 0.2)},
+        np.full((3, 2), 0.2 * sigma_px**2),
+    )
+    return float(_drift_sigma(problem, result, USUAL_PX)[0])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("sigma_px", [0.1, 1.0, 6.0])
+def test_a_drift_that_the_views_of_a_visit_share_does_not_widen_its_own_prior(
+    sigma_px: float,
+) -> None:
+    common = np.array([[3.0, -5.0], [2.0, 4.0], [-6.0, 1.0]])[VISITS]
+    assert estimated(common, sigma_px) < 1.01 * USUAL_PX
+
+
+def test_drifts_that_differ_have_the_spread_of_their_differences() -> None:
+    rng = np.random.default_rng(0)
+    own = rng.normal(0.0, 0.7, (len(VISITS), 2))
+    for common in (0.0, 4.0):
+        sigma = 0.3
+        for _ in range(30):
+            sigma = estimated(own + common, sigma)
+        # Fifteen views with two drifts each, of which three visits keep one: 24 degrees of freedom, 15 %.
+        assert sigma == pytest.approx(0.7, rel=0.45)
