@@ -44,13 +44,20 @@ from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
     stack_rows,
     view_residuals,
+    whitened_norm,
 )
-from semcal_ros.core.calibration.estimator.variance_components import Spread, VarianceComponents
+from semcal_ros.core.calibration.estimator.variance_components import (
+    Spread,
+    VarianceComponents,
+    initial_components,
+)
 from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import add_shared_unknowns
 from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.grid_views import grid_views
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
+from tests.helpers.calibrations import calibrated
 
 MICROSCOPE = preset("strong_perspective")
 
@@ -319,3 +326,45 @@ def test_derivatives_of_the_corners(system):
             np.testing.assert_allclose(
                 found / scale, expected / scale, rtol=1e-4, atol=1e-6, err_msg=block.name
             )
+
+
+def test_the_cost_curves_with_a_tilt_as_is_said():
+    """Of a view that stands flat although it is tilted: there the first derivatives by the tilt vanish."""
+    microscope = preset("parallel")
+    views = grid_views(microscope.camera_at, (2000.0,), noise_px=0.05, views=3, seed=4)
+    size, width = microscope.image_size, microscope.display_width_m
+    setup = Setup(tuple(views), np.array([2000.0]), size, width, Priors(rho_mean=0.0))
+    functions = constant_functions(setup, {})
+    problem = build_problem(setup, functions, setup.views, initial_components(setup))
+    start = _start(setup, functions)
+    # Every view is flat: the tilted ones leave residuals of many sigmas.
+    state = empty_effects(problem, replace(start, rotations=np.stack([np.eye(3)] * len(views))))
+    corners = corner_rows(problem, state)
+    turn = corners.layout["view.turn"]
+    for v, (first, last) in enumerate(zip(problem.starts[:-1], problem.starts[1:], strict=True)):
+        rows = corners.rows[:, turn, first:last]
+        by_first = np.einsum("kpn,kqn->pq", rows, rows)
+        curvature = by_first + corners.turn_curvature[v]
+        huber = corners.huber_weight[first:last]
+
+        def cost(step, v=v, first=first, last=last, huber=huber):
+            turns = np.zeros((len(views), problem.layout.of_view.size))
+            turns[v, problem.layout.of_view["view.turn"]] = step
+            still = np.zeros_like(state.visits)
+            moved = retract(problem, state, np.zeros_like(state.theta), turns, still)
+            left = whitened_norm(problem, corner_residuals(problem, moved))[first:last]
+            return 0.5 * float(np.sum(huber * left**2))
+
+        step = 1e-3
+        for axis in np.eye(3)[:2]:
+            second = (cost(step * axis) - 2.0 * cost(0.0 * axis) + cost(-step * axis)) / step**2
+            assert second == pytest.approx(axis @ curvature @ axis, rel=2e-3)
+            # Without the second derivatives there would be hardly any.
+            assert axis @ by_first @ axis < 0.1 * abs(second)
+
+
+@pytest.mark.parametrize("seed", [2, 6])
+def test_flat_views_under_parallel_projection_converge(seed):
+    """The tilt of a view from above acts by its square alone; such views once stopped at the iteration limit."""
+    result = calibrated("parallel", seed=seed)
+    assert result.model.statistics["fit"]["converged"]

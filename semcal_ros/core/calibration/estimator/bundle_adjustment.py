@@ -230,7 +230,7 @@ def refine(
         return _make_result(problem, state, cost, iterations, status, 0.0)
 
     def linearise(point: _Point) -> Callable[[float], Step[_Point] | None]:
-        normal = normal_equations(problem, point.state)
+        normal = normal_equations(problem, point.state, for_step=True)
 
         def solve(damping: float) -> Step[_Point] | None:
             change = _change(problem, point.state, normal, damping)
@@ -290,7 +290,7 @@ def _refine_poses(
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        normal = normal_equations(problem, state, poses_only=True)
+        normal = normal_equations(problem, state, poses_only=True, for_step=True)
         pose = normal.matrix[:, own, own].copy()
         pose[:, diagonal, diagonal] = damped_diagonal(pose, damping[:, None])
         try:

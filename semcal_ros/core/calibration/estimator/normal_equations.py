@@ -57,11 +57,14 @@ class NormalEquations:
 
 
 def normal_equations(
-    problem: Problem, state: State, *, poses_only: bool = False
+    problem: Problem, state: State, *, poses_only: bool = False, for_step: bool = False
 ) -> NormalEquations:
     """Compute the Huber-weighted normal equations of every view, with all that is known of the view.
 
     With ``poses_only`` the corners fill only the columns of the view's own unknowns, which takes a third of the time.
+    ``for_step`` adds the size of the second derivatives by the turns of the views: steps by the first alone go astray
+    where a tilt acts by its square. By its size, also where a flat view is the highest point and not the lowest, a step
+    leads downwards (saddle-free Newton: Dauphin et al. 2014, arXiv:1406.2572).
     What is known of visits and of theta comes in when these are eliminated and reduced.
     """
     corners = corner_rows(problem, state, poses_only=poses_only)
@@ -74,6 +77,10 @@ def normal_equations(
         np.matmul(x, x.T, out=own)
         own += y @ y.T
     matrix[:, columns[:, None], columns] += observed
+    if for_step:
+        turn = problem.layout["view.turn"]
+        values, axes = np.linalg.eigh(corners.turn_curvature)
+        matrix[:, turn, turn] += (axes * np.abs(values)[:, None, :]) @ np.swapaxes(axes, 1, 2)
     return NormalEquations(
         matrix[:, :-1, :-1], matrix[:, :-1, -1], corners.residuals_px, corners.huber_weight
     )

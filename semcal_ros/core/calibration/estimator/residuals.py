@@ -271,6 +271,8 @@ class CornerRows:
         (N, 2) without weights.
     huber_weight
         (N,).
+    turn_curvature
+        (V, 3, 3) what the cost curves with the turn of each view beside the square of ``rows``.
     """
 
     layout: Layout
@@ -278,6 +280,7 @@ class CornerRows:
     rows: Array
     residuals_px: Array
     huber_weight: Array
+    turn_curvature: Array
 
 
 class _CornerDerivatives:
@@ -376,7 +379,29 @@ def corner_rows(problem: Problem, state: State, *, poses_only: bool = False) -> 
     rows[:, :, huber == 0.0] = 0.0
     whiten(problem.whitening, rows, huber)
     columns = np.append(problem.layout.columns(layout), problem.layout.size)
-    return CornerRows(layout, columns, rows, left, huber)
+    curvature = _turn_curvature(problem, derivatives, left, huber)
+    return CornerRows(layout, columns, rows, left, huber, curvature)
+
+
+def _turn_curvature(
+    problem: Problem, derivatives: _CornerDerivatives, left: Array, huber: Array
+) -> Array:
+    """Return the second derivatives (V, 3, 3) of the cost by the turns of views that come with the residuals.
+
+    A turn ``w`` moves a point ``p`` by ``w x p + w x (w x p) / 2``. Where a parallel projection sees a view from above,
+    the tilt acts by the second term alone, so that the square of the first derivatives says nothing of it.
+    """
+    xx, yx, yy = problem.whitening.T
+    x = xx * left[:, 0]
+    y = yx * left[:, 0] + yy * left[:, 1]
+    pull = np.stack([xx * x + yx * y, yy * y]) * huber
+    force = np.einsum("kjn,kn->nj", derivatives.by_point, pull)
+    force[huber == 0.0] = 0.0
+    products = force[:, :, None] * derivatives.rotated[:, None, :]
+    moment = np.add.reduceat(products, problem.starts[:-1], axis=0)
+    symmetric = 0.5 * (moment + np.swapaxes(moment, 1, 2))
+    trace = np.trace(moment, axis1=1, axis2=2)
+    return np.asarray(trace[:, None, None] * np.eye(3) - symmetric)
 
 
 def whiten(whitening: Array, rows: Array, huber: Array) -> None:
