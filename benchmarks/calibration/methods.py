@@ -27,7 +27,7 @@ from scipy.interpolate import PchipInterpolator
 
 from benchmarks.calibration.cases import HEIGHT_SIGMA_M, Array, Case, PixelSize
 from benchmarks.calibration.opencv import OpenCv
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import Priors, Setup
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.paper.discrete import DiscreteFit, fit_discrete, table_functions

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import click
 
 from semcal_ros.cli.options import squares_option
-from semcal_ros.core.calibration.untilted import UNTILTED_MODES
+from semcal_ros.core.calibration.start import UNTILTED_MODES
 from semcal_ros.core.corners import PATTERNS
 from semcal_ros.core.errors import InvalidValueError
 

@@ -159,7 +159,7 @@ def echo_paths(paths: Mapping[str, Path | None]) -> None:
 def echo_verdict(calibration: CalibrationModel) -> None:
     """Print how well a calibration knows nm per pixel, and what would improve that."""
     # Imported here, so that commands without a calibration do not wait for it.
-    from semcal_ros.core.calibration.judgement.verdict import judge_calibration
+    from semcal_ros.core.calibration.judgement.plan import judge_calibration
 
     verdict = judge_calibration(calibration)
     for line in (verdict.describe(), verdict.advise()):

@@ -36,8 +36,8 @@ from semcal_ros.bridge.images import without_databar
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.arrays import Mask, check_range
-from semcal_ros.core.calibration.nominal_scale import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.calibration.start import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.conditions import find_conditions

@@ -42,7 +42,7 @@ from semcal_ros.core.calibration.acquisition import (
     is_magnification_of,
 )
 from semcal_ros.core.calibration.judgement.check import Verdict
-from semcal_ros.core.calibration.judgement.view_coverage import measure_view_coverage
+from semcal_ros.core.calibration.judgement.findings import measure_view_coverage
 from semcal_ros.core.calibration.options import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView

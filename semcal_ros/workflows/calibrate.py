@@ -25,16 +25,16 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.finding import Finding
 from semcal_ros.core.calibration.judgement.findings import find_all
-from semcal_ros.core.calibration.nominal_scale import (
+from semcal_ros.core.calibration.method_fit import Finding
+from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
+from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, are_enough, calibrate_views
+from semcal_ros.core.calibration.stage import StageAxis
+from semcal_ros.core.calibration.start import (
     check_nominal_scale,
     check_square_sides,
     is_scale_far,
 )
-from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
-from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, are_enough, calibrate_views
-from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import (
     FoundView,
     GridView,

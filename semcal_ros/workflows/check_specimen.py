@@ -26,7 +26,7 @@ import numpy as np
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.arrays import Array32, check_positive
-from semcal_ros.core.calibration.stage_moves import StageIsotropy, fit_stage_moves
+from semcal_ros.core.calibration.stage import StageIsotropy, fit_stage_moves
 from semcal_ros.core.camera.scan_camera import RectifiedCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.registration.affine import NotAlignedError, align_affine

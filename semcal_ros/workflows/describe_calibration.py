@@ -21,7 +21,7 @@ from dataclasses import asdict
 from typing import Any
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.judgement.verdict import judge_calibration
+from semcal_ros.core.calibration.judgement.plan import judge_calibration
 
 __all__ = ["describe_calibration"]
 

@@ -88,7 +88,7 @@ class CalibrationOptions:
         ``"joint"``): ``"on"``, ``"off"``, or ``"auto"``, where cross-validation decides.
     untilted
         Names of views in which the specimen is not tilted, ``"none"``, or ``"auto"`` (see
-        :func:`~semcal_ros.core.calibration.untilted.mark_untilted`). The readings of a stage take
+        :func:`~semcal_ros.core.calibration.start.mark_untilted`). The readings of a stage take
         precedence over ``"auto"``.
     squares_sigma
         Relative 1-sigma of the size of the grid's squares, from its certificate.

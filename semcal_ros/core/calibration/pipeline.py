@@ -42,24 +42,17 @@ import numpy as np
 from scipy.stats import chi2
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_factor
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
-from semcal_ros.core.calibration.estimator.problem import build_problem, variance_factor
+from semcal_ros.core.calibration.estimator.problem import Priors, Setup, build_problem
 from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
-from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
-from semcal_ros.core.calibration.judgement.finding import Finding
 from semcal_ros.core.calibration.judgement.outliers import (
     find_outliers,
     find_wrong_tilts,
     measure_deviations,
 )
-from semcal_ros.core.calibration.method_fit import MethodFit, make_model
-from semcal_ros.core.calibration.nominal_scale import (
-    advise_scale,
-    check_nominal_scale,
-    observed_scale_factor,
-)
+from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.paper.methods import fit_separately
 from semcal_ros.core.calibration.select import select
@@ -70,8 +63,18 @@ from semcal_ros.core.calibration.stage import (
     attitudes,
     stage_rotations,
 )
-from semcal_ros.core.calibration.start import adapt_priors, add_shared_unknowns, start, with_excess
-from semcal_ros.core.calibration.untilted import look_untilted, mark_untilted
+from semcal_ros.core.calibration.start import (
+    adapt_priors,
+    add_shared_unknowns,
+    advise_scale,
+    align_lattices,
+    check_nominal_scale,
+    look_untilted,
+    mark_untilted,
+    observed_scale_factor,
+    start,
+    with_excess,
+)
 from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
 from semcal_ros.core.corners.detection import MINIMUM_CORNERS
 from semcal_ros.core.errors import (

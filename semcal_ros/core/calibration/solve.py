@@ -22,9 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
-from semcal_ros.core.calibration.estimator.adjustment import Adjustment, FittedField, GridPattern
-from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.line_jitter import LineJitter, estimate_jitter
+from semcal_ros.core.calibration.estimator.bundle_adjustment import Adjustment, refine
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import (
     refine_coarsely,
@@ -33,24 +31,28 @@ from semcal_ros.core.calibration.estimator.poses import (
 )
 from semcal_ros.core.calibration.estimator.posterior import (
     CovarianceParts,
+    LineJitter,
+    estimate_jitter,
     pad_covariance,
     pad_functions,
     pattern_covariance,
     split_covariance,
 )
-from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import (
     Functions,
+    Setup,
+    VarianceComponents,
     build_problem,
     with_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residual_field_fit import (
+    FittedField,
+    GridPattern,
     field_system,
     solve_field,
     undo_field,
 )
 from semcal_ros.core.calibration.estimator.variance_components import (
-    VarianceComponents,
     limit_components,
     update_components,
 )

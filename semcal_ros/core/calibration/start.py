@@ -15,53 +15,305 @@
 """From views and nominal values to a first state, coarse to fine.
 
 Corners start as uncertain as a plane under a perspective leaves them: what they show besides is the distortion, which
-the model does not have yet."""
+the model does not have yet. Before that come the scale that the views show against the predicted one, the views that
+show the specimen untilted, where no stage says so, and the axes of the lattices: a chess grid looks the same after a
+quarter turn, so that the lattice of a view has one of four directions by chance. Where the stage says how far it
+turned, all views are given the same axes, which what belongs to the grid (its stretch and shear) needs.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import MEDIAN_CHI2_2
-from semcal_ros.core.calibration.estimator.adjustment import SMOOTH, refit_functions
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Mask
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
+from semcal_ros.core.calibration.estimator.bundle_adjustment import SMOOTH, refit_functions
 from semcal_ros.core.calibration.estimator.poses import (
     COARSE,
     adjust,
+    initial_values,
     refine_coarsely,
     resolve_mirrored_tilts,
     right_way_up,
     thin_view,
 )
-from semcal_ros.core.calibration.estimator.priors import Setup
 from semcal_ros.core.calibration.estimator.problem import (
     Functions,
+    Setup,
+    VarianceComponents,
     build_problem,
     constant_functions,
+    initial_components,
     stack_coefficients,
     stack_theta,
     with_coefficients,
 )
-from semcal_ros.core.calibration.estimator.variance_components import (
-    VarianceComponents,
-    initial_components,
-    update_components,
-)
-from semcal_ros.core.calibration.initial_values import initial_values
-from semcal_ros.core.calibration.stage import OFFSET_NAMES
-from semcal_ros.core.calibration.views import add_excess_noise
-from semcal_ros.core.camera.plane_geometry import fit_homography
+from semcal_ros.core.calibration.estimator.variance_components import update_components
+from semcal_ros.core.calibration.stage import OFFSET_NAMES, Attitudes, attitudes, stage_rotations
+from semcal_ros.core.calibration.views import GridView, add_excess_noise
+from semcal_ros.core.camera.plane_geometry import fit_homography, view_affine
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 
 __all__ = [
+    "DISPLAY_WIDTH_LIMITS_M",
+    "UNTILTED_MODES",
     "Start",
     "adapt_priors",
     "add_shared_unknowns",
+    "advise_scale",
+    "align_lattices",
+    "check_nominal_scale",
+    "check_square_sides",
+    "is_scale_far",
+    "look_untilted",
+    "mark_untilted",
     "measure_misfit_px",
+    "observed_scale_factor",
     "start",
     "tempered",
     "with_excess",
 ]
+
+# Display widths of real files are 114 to 519 mm (design, section 3), so a guess from their middle is
+# wrong by 2.1 at most. What is off by more is another unit, or not a microscope; and it is 4 sigmas
+# from the prior of the scale, which would bend everything else.
+_FAR = 3.0
+# In octaves: with the right display width, the scale of a microscope is never this close to a factor
+# of two.
+_TWICE = 0.12
+#: Widths of displays that are accepted, from a chip's to a projector's, m.
+DISPLAY_WIDTH_LIMITS_M = (1e-3, 100.0)
+_UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+
+
+def observed_scale_factor(views: Sequence[GridView], nominal_px_per_m: Array) -> float:
+    """Return the median ratio of observed to nominal scale, from the homographies of the views.
+
+    Parameters
+    ----------
+    views
+        V views.
+    nominal_px_per_m
+        (V,) scale that the nominal values predict for each.
+    """
+    affines = [view_affine(v.board_xy_m, v.image_xy, v.image_xy.mean(axis=0)) for v in views]
+    return float(np.median(np.array([a.scale for a in affines]) / nominal_px_per_m))
+
+
+def is_scale_far(factor: Array) -> Mask:
+    """Return whether ratios of observed to nominal scale are too far from 1 for a calibration."""
+    return (factor < 1.0 / _FAR) | (factor > _FAR)
+
+
+def advise_scale(
+    factor: float,
+    *,
+    display_width_m: float,
+    squares_m: Sequence[float],
+    pixel_size_m: float | None = None,
+) -> str:
+    """Return the options that make the nominal scale the observed one; see :func:`check_nominal_scale`."""
+    width_m = display_width_m / factor
+    ways = []
+    if DISPLAY_WIDTH_LIMITS_M[0] <= width_m <= DISPLAY_WIDTH_LIMITS_M[1]:
+        ways.append(f"--display-width {_format_length(width_m)}")
+    if pixel_size_m is not None:
+        size = _format_length(pixel_size_m / factor)
+        ways.append(f"--pixel-size {size} in place of a magnification or another pixel size")
+    fitting = ", or ".join(ways) or f"magnifications {factor:.4g} times as large"
+    if not squares_m:
+        return f"give {fitting} (display_width_m in a configuration)"
+    sides = ",".join(_format_length(factor * side) for side in sorted(set(squares_m), reverse=True))
+    return (
+        f"if the squares are right, give {fitting}; if the magnification is, give --squares {sides} "
+        "(display_width_m and squares_m in a configuration)"
+    )
+
+
+def check_nominal_scale(
+    factor: float,
+    *,
+    display_width_m: float,
+    squares_m: Sequence[float],
+    pixel_size_m: float | None = None,
+) -> None:
+    """Refuse views whose scale is far from that of their units.
+
+    Parameters
+    ----------
+    factor
+        Ratio of the observed to the nominal scale.
+    display_width_m
+        Display width to which the magnifications refer, m.
+    squares_m
+        Sides of the squares in view, m; empty where they are not known.
+    pixel_size_m
+        Nominal pixel size, where all views have the same, m.
+
+    Raises
+    ------
+    UnusableCalibrationError
+        If it is off by more than a factor of 3; the error says what would fit.
+    """
+    if not is_scale_far(np.array(factor)):
+        return
+    sides = " and ".join(_format_length(side) for side in sorted(set(squares_m), reverse=True))
+    raise UnusableCalibrationError(
+        f"images that show {factor:.3g} times the scale that a display width of "
+        f"{_format_length(display_width_m)}"
+        + (f" and squares of {sides}" if sides else "")
+        + " predict",
+        expected=f"a scale within a factor of {_FAR:g} of the predicted one",
+        do=advise_scale(
+            factor,
+            display_width_m=display_width_m,
+            squares_m=squares_m,
+            pixel_size_m=pixel_size_m,
+        ),
+    )
+
+
+def check_square_sides(factor: float, display_width_m: float) -> None:
+    """Refuse a scale that results from confusing the side of a square with the period of the grid.
+
+    Raises
+    ------
+    CalibrationError
+        If the ratio of the observed to the nominal scale is about 2 or a half.
+    """
+    if abs(abs(np.log2(factor)) - 1.0) >= _TWICE:
+        return
+    width_m = display_width_m / factor
+    raise CalibrationError(
+        f"images that show {factor:.3g} times the scale that squares_m and the display width of "
+        f"{display_width_m:g} m predict",
+        expected="squares_m to hold the sides of single squares, not the period of the grid",
+        do=f"correct squares_m (--squares), or if that is right, set display_width_m to {width_m:.4g} m "
+        f"(--display-width {_format_length(width_m)})",
+    )
+
+
+def _format_length(length_m: float) -> str:
+    """Format a length as options take it, such as ``25.1mm``."""
+    unit, size_m = next((u for u in _UNITS if length_m >= u[1]), _UNITS[-1])
+    return f"{float(f'{length_m / size_m:.4g}'):g}{unit}"
+
+
+_QUARTER = 0.5 * np.pi
+
+
+def align_lattices(setup: Setup) -> Setup:
+    """Return the setup with lattices of the same axes, and with the start of the stage's rotation.
+
+    Views of which the stage does not say the rotation stay as they are.
+    """
+    known = attitudes(
+        [v.stage for v in setup.views],
+        [False] * len(setup.views),
+        setup.axis,
+        setup.priors.untilted_sigma_rad,
+    )
+    turn = _turns(setup, known)
+    told = np.isfinite(known.sigma_rad[:, 2])
+    if not np.any(told):
+        return setup
+    # The mean of angles that are known up to quarter turns.
+    offset = float(np.angle(np.mean(np.exp(4j * turn[told])))) / 4.0
+    quarters = np.where(told, np.round((turn - offset) / _QUARTER), 0.0).astype(int)
+    views = tuple(_turned(v, int(k)) for v, k in zip(setup.views, quarters, strict=True))
+    return replace(setup, views=views, stage_rotation_rad=offset)
+
+
+def _turns(setup: Setup, known: Attitudes) -> Array:
+    """Return the (V,) angles about the normal by which the views differ from the stage's."""
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    expected, _ = stage_rotations(known, np.zeros(5))
+    # The sign of the tilt is not known yet. What it changes about the turn is small.
+    left = np.swapaxes(expected, 1, 2) @ start.rotations
+    return np.arctan2(left[:, 1, 0] - left[:, 0, 1], left[:, 0, 0] + left[:, 1, 1])
+
+
+def _turned(view: GridView, quarters: int) -> GridView:
+    """Return the view with a grid that is turned by so many quarters, and its pose turned back."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    x, y = view.board_xy_m.T
+    return replace(view, board_xy_m=np.stack([c * x - s * y, s * x + c * y], axis=1))
+
+
+UNTILTED_MODES = ("auto", "all", "none")
+
+# Apparent tilt below which a view may be untilted: an aspect ratio that is 1 % off looks like 8
+# degrees. Views up to twice as much could be either.
+_FLAT_RAD, _CLEARLY_TILTED_RAD = np.radians(8.0), np.radians(16.0)
+
+
+def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
+    """Return the setup with views that are known not to be tilted.
+
+    Parameters
+    ----------
+    untilted
+        Names of such views, ``"all"``, ``"none"``, or ``"auto"``: the view with the least apparent tilt of
+        each visit, if it looks untilted and every other view of the visit is clearly tilted.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no view of that name, or a mode is not known.
+    """
+    if isinstance(untilted, str):
+        if untilted not in UNTILTED_MODES:
+            raise InvalidValueError(
+                f"untilted {untilted!r}",
+                expected=f"{', '.join(UNTILTED_MODES)}, or a list of names of views",
+            )
+        if untilted == "none" or (
+            untilted == "auto" and any(v.has_stage_tilt for v in setup.views)
+        ):
+            return setup
+        chosen = set(range(len(setup.views))) if untilted == "all" else _apparently_untilted(setup)
+    else:
+        names = {view.name for view in setup.views}
+        unknown = [name for name in untilted if name not in names]
+        if unknown:
+            raise InvalidValueError(
+                f"untilted {', '.join(map(repr, unknown[:3]))}",
+                expected="names of views that were used, such as " + ", ".join(sorted(names)[:3]),
+            )
+        chosen = {i for i, view in enumerate(setup.views) if view.name in set(untilted)}
+    views = tuple(
+        replace(view, untilted=True) if i in chosen else view for i, view in enumerate(setup.views)
+    )
+    return replace(setup, views=views)
+
+
+def look_untilted(setup: Setup) -> bool:
+    """Whether every view looks tilted by no more than an aspect ratio that is not 1 makes it look."""
+    return bool(np.all(_apparent_tilts(setup) < _CLEARLY_TILTED_RAD))
+
+
+def _apparent_tilts(setup: Setup) -> Array:
+    """Return the (V,) tilts, rad, under a camera with square pixels and no distortion."""
+    nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
+    start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
+    return np.arccos(np.clip(start.rotations[:, 2, 2], -1.0, 1.0))
+
+
+def _apparently_untilted(setup: Setup) -> set[int]:
+    tilt = _apparent_tilts(setup)
+    visit, groups = setup.visits
+    chosen = set()
+    for own in (np.flatnonzero(visit == j) for j in range(len(groups))):
+        least = own[np.argmin(tilt[own])]
+        others = own[own != least]
+        if len(others) and tilt[least] < _FLAT_RAD and np.all(tilt[others] > _CLEARLY_TILTED_RAD):
+            chosen.add(int(least))
+    return chosen
+
 
 # Updates of the variance components before anything is selected: they have to be near only, since every later
 # adjustment updates them again.

@@ -23,9 +23,9 @@ from typing import Protocol
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.acquisition import ViewRequest
-from semcal_ros.core.calibration.recentring import (
+from semcal_ros.core.calibration.acquisition import (
     PROBE_SQUARES,
+    ViewRequest,
     find_stage_move,
     grid_is_centred,
     image_from_stage,

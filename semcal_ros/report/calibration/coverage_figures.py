@@ -24,7 +24,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.coverage import (
+from semcal_ros.core.calibration.judgement.findings import (
     assign_cells,
     compute_reached_shares,
     compute_tilts_deg,

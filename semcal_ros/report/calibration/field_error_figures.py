@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.coverage import assign_cells, concatenate_corners
+from semcal_ros.core.calibration.judgement.findings import assign_cells, concatenate_corners
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.wording import counted

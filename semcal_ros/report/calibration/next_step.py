@@ -20,7 +20,7 @@ import math
 import shlex
 from pathlib import PurePath
 
-from semcal_ros.core.calibration.judgement.verdict import Verdict
+from semcal_ros.core.calibration.judgement.plan import Verdict
 from semcal_ros.core.wording import rounded_magnification
 
 __all__ = ["suggest_commands"]

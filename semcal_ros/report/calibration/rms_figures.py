@@ -24,7 +24,7 @@ from matplotlib.axes import Axes
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.residual_pattern import normalise_residuals
+from semcal_ros.core.calibration.judgement.findings import normalise_residuals
 from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
 from semcal_ros.report.html.encode import Picture, Readings, encode_figure
 from semcal_ros.report.html.style import (

@@ -23,7 +23,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.coverage import compute_tilts_deg
+from semcal_ros.core.calibration.judgement.findings import compute_tilts_deg
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.wording import counted
 from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink

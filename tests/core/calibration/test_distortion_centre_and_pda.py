@@ -22,8 +22,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from semcal_ros.core.calibration.paper.discrete import DiscreteFit
-from semcal_ros.core.calibration.paper.distortion_centre import find_distortion_centre
+from semcal_ros.core.calibration.paper.discrete import DiscreteFit, find_distortion_centre
 from semcal_ros.core.calibration.paper.pda import ode_weights, pda_functions
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera

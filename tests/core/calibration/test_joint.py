@@ -22,14 +22,14 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import solve_scaled
-from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine, variance_factor
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import mirror, restart_poses, right_way_up
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
 from semcal_ros.core.calibration.estimator.problem import (
+    Priors,
+    Setup,
     build_problem,
     stack_coefficients,
-    variance_factor,
 )
 from semcal_ros.core.calibration.estimator.residuals import corner_residuals
 from semcal_ros.core.calibration.pipeline import fit_joint

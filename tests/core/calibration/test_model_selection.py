@@ -19,9 +19,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
-from semcal_ros.core.calibration.estimator.problem import constant_functions
-from semcal_ros.core.calibration.model_selection import Summary, select_functions
+from semcal_ros.core.calibration.estimator.problem import Priors, Setup, constant_functions
+from semcal_ros.core.calibration.select import Summary, select_functions
 
 MAGNIFICATIONS = np.geomspace(100.0, 10000.0, 6)
 

@@ -25,9 +25,9 @@ import pytest
 from semcal_ros.core.calibration import pipeline
 from semcal_ros.core.calibration import solve as solve_module
 from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
-from semcal_ros.core.calibration.nominal_scale import check_nominal_scale, check_square_sides
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
+from semcal_ros.core.calibration.start import check_nominal_scale, check_square_sides
 from semcal_ros.core.errors import CalibrationError, UnusableCalibrationError
 from semcal_ros.synthetic import preset
 from tests.helpers.calibrations import seen_views

@@ -32,10 +32,14 @@ from semcal_ros.core.calibration.estimator.normal_equations import (
     reduced_normal_equations,
     schur_complement,
 )
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
 from semcal_ros.core.calibration.estimator.problem import (
+    Priors,
+    Setup,
+    Spread,
+    VarianceComponents,
     build_problem,
     constant_functions,
+    initial_components,
     stack_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residuals import (
@@ -46,14 +50,8 @@ from semcal_ros.core.calibration.estimator.residuals import (
     view_residuals,
     whitened_norm,
 )
-from semcal_ros.core.calibration.estimator.variance_components import (
-    Spread,
-    VarianceComponents,
-    initial_components,
-)
-from semcal_ros.core.calibration.grid_orientation import align_lattices
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.start import add_shared_unknowns
+from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
@@ -105,7 +103,7 @@ def system(request):
 
 
 def _start(setup, functions):
-    from semcal_ros.core.calibration.initial_values import initial_values
+    from semcal_ros.core.calibration.estimator.poses import initial_values
 
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)

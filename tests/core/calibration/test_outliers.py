@@ -23,7 +23,7 @@ import pytest
 
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import Priors, Setup
 from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
 from semcal_ros.core.calibration.judgement.outliers import find_change_point, find_outliers
 from semcal_ros.core.calibration.options import CalibrationOptions

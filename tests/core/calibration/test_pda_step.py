@@ -22,10 +22,10 @@ import pytest
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
 from semcal_ros.core.calibration.paper.discrete import DiscreteFit
-from semcal_ros.core.calibration.paper.pda import equation_error
-from semcal_ros.core.calibration.paper.pda_step import (
+from semcal_ros.core.calibration.paper.pda import (
     StepTrial,
     choose_step,
+    equation_error,
     select_magnifications,
     try_steps,
 )

@@ -20,9 +20,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.judgement.plan import ViewPlan, plan_views
+from semcal_ros.core.calibration.judgement.plan import ViewPlan, judge_calibration, plan_views
 from semcal_ros.core.calibration.judgement.update import update_calibration
-from semcal_ros.core.calibration.judgement.verdict import judge_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel

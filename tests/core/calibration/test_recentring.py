@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.recentring import (
+from semcal_ros.core.calibration.acquisition import (
     PROBE_SQUARES,
     find_stage_move,
     grid_is_centred,

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.stage_moves import StageIsotropy, fit_stage_moves
+from semcal_ros.core.calibration.stage import StageIsotropy, fit_stage_moves
 from semcal_ros.core.errors import InvalidValueError
 
 PIXEL_M = 2e-8

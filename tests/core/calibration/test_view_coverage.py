@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.core.calibration.judgement.view_coverage import (
+from semcal_ros.core.calibration.judgement.findings import (
     estimate_tilt_deg,
     measure_view_coverage,
 )

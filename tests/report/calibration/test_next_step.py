@@ -27,8 +27,7 @@ from click.testing import CliRunner
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.at_command import command as at_command
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.plan import PlannedVisit
-from semcal_ros.core.calibration.judgement.verdict import Verdict
+from semcal_ros.core.calibration.judgement.plan import PlannedVisit, Verdict
 from semcal_ros.report import write_calibration_report
 from semcal_ros.report.calibration import page
 from semcal_ros.report.calibration.next_step import suggest_commands

@@ -25,15 +25,15 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.coverage import (
+from semcal_ros.core.calibration.judgement.evaluate import fit_poses, rms_by_magnification
+from semcal_ros.core.calibration.judgement.findings import (
     compute_empty_share,
     compute_reached_shares,
     compute_tilts_deg,
+    estimate_pattern_px,
+    find_all,
 )
-from semcal_ros.core.calibration.judgement.evaluate import fit_poses, rms_by_magnification
-from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
-from semcal_ros.core.calibration.judgement.findings import find_all
-from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
+from semcal_ros.core.calibration.method_fit import Finding, rank_findings
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.predicted_error import (

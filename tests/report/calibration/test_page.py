@@ -29,7 +29,7 @@ import pytest
 
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.judgement.finding import Finding
+from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import FoundView, GridView

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,11 +45,13 @@ from semcal_ros.core.calibration.estimator.normal_equations import (
     schur_complement,
     sum_by,
 )
+from semcal_ros.core.calibration.estimator.problem import Functions, VarianceComponents
 from semcal_ros.core.calibration.estimator.residuals import (
     prior_cost,
     stack_rows,
     view_costs,
     view_residuals,
+    whitened_norm,
 )
 from semcal_ros.core.calibration.estimator.trust_region import (
     FIRST_DAMPING,
@@ -58,8 +60,18 @@ from semcal_ros.core.calibration.estimator.trust_region import (
     Step,
     descend,
 )
+from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS
+from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
-__all__ = ["BundleResult", "refine"]
+__all__ = [
+    "SMOOTH",
+    "Adjustment",
+    "BundleResult",
+    "refine",
+    "refit_functions",
+    "variance_factor",
+    "weighted_squares",
+]
 
 
 # A guard against endless iteration; the result says where it was reached.
@@ -428,3 +440,68 @@ def _make_singular_result(
         iterations=iterations,
         status=DescentStatus.SINGULAR,
     )
+
+
+def weighted_squares(problem: Problem, result: BundleResult) -> Array:
+    """(N,) squares of the whitened residuals with their weights; 0 for a point without a projection."""
+    square = whitened_norm(problem, result.residuals_px) ** 2
+    return np.where(result.huber_weight > 0.0, square, 0.0) * result.huber_weight
+
+
+def variance_factor(problem: Problem, result: BundleResult) -> float:
+    """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
+    norm2 = weighted_squares(problem, result)
+    unknowns = problem.layout.of_view.size * len(problem.group) + len(result.state.theta)
+    freedom = 2.0 * result.huber_weight.sum() - unknowns - result.state.visits.size
+    return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))
+
+
+SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Continuous functions with a chosen number of coefficients, adjusted to the views.
+
+    Attributes
+    ----------
+    functions
+        The functions.
+    problem, result
+        The adjustment that gave their coefficients.
+    spread
+        Its variance components.
+    rounds
+        Number of times that the numbers of coefficients were chosen.
+    converged
+        Whether the last choice was the same as that of the round before.
+    """
+
+    functions: Functions
+    problem: Problem
+    result: BundleResult
+    spread: VarianceComponents
+    rounds: int
+    converged: bool
+
+
+def refit_functions(
+    functions: Functions, sizes: Mapping[str, tuple[str, int]]
+) -> dict[str, ContinuousFunction]:
+    """Fit functions of other kinds and sizes to the values of the given ones, by least squares."""
+    out: dict[str, ContinuousFunction] = {}
+    none = replace(functions["scale"], coefficients=np.zeros(1), breaks=np.zeros(0))
+    for name in ALL_FUNCTIONS:
+        function = functions.get(name, none)
+        kind, size = sizes.get(
+            name, (function.kind, function.smooth_size if name in functions else 0)
+        )
+        if size == 0:
+            continue
+        zeros = np.zeros(size + len(function.breaks))
+        blank = ContinuousFunction(kind, zeros, function.g_range, breaks=function.breaks)
+        grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
+        basis = np.stack([blank.basis(float(g)) for g in grid])
+        values = np.array([function(float(g)) for g in grid])
+        out[name] = replace(blank, coefficients=np.linalg.lstsq(basis, values, rcond=None)[0])
+    return out

@@ -12,51 +12,266 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is known after an adjustment: the covariance of the coefficients, and what it consists of."""
+"""What is known after an adjustment: that it ended at a minimum, the covariance, and what this consists of.
+
+Vibration and mains hum move whole lines along x. The corners on them are then wrong together, and their number does not
+make a calibration as certain as if they were independent. The estimate by least squares stays as it is; its covariance
+is that of the sandwich formula (White 1982, doi:10.2307/1912526), ``H^-1 (J' V J) H^-1``, with the covariance ``V`` of
+the residuals between lines, which is estimated from their products.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import toeplitz
+from scipy.optimize import nnls
 
-from semcal_ros.core.arrays import Array, Indices, solve_scaled
-from semcal_ros.core.calibration.estimator.adjustment import (
+from semcal_ros.core.arrays import Array, Indices, equilibrate, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     SMOOTH,
     Adjustment,
-    FittedField,
-    GridPattern,
-)
-from semcal_ros.core.calibration.estimator.blocks import Problem
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.estimator.line_jitter import LineJitter, jitter_covariance
-from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
-from semcal_ros.core.calibration.estimator.priors import Setup
-from semcal_ros.core.calibration.estimator.problem import (
-    Functions,
-    build_problem,
-    stack_theta,
+    BundleResult,
+    refine,
     variance_factor,
 )
+from semcal_ros.core.calibration.estimator.normal_equations import (
+    normal_equations,
+    reduced_normal_equations,
+    schur_complement,
+)
+from semcal_ros.core.calibration.estimator.problem import (
+    Functions,
+    Setup,
+    build_problem,
+    stack_theta,
+)
 from semcal_ros.core.calibration.estimator.residual_field_fit import (
+    FittedField,
+    GridPattern,
     blank_field,
     field_system,
     held_prior,
     solve_field,
     undo_field,
 )
+from semcal_ros.core.calibration.estimator.residuals import corner_rows
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.fit_record import Certificate
+from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = [
     "CovarianceParts",
+    "LineJitter",
+    "certify",
+    "estimate_jitter",
+    "jitter_covariance",
     "pad_covariance",
     "pad_functions",
     "pattern_covariance",
     "split_covariance",
 ]
+
+# Of an unknown that is still on its way, in sigmas: far beyond what the last step of a converged fit leaves, which is
+# some hundredths.
+_LARGEST_REMAINING = 1.0
+# Part of the prior variance of a constant beyond which the prior holds it.
+_HELD = 0.64
+_NAMED = 3
+
+
+def certify(functions: Functions, problem: Problem, result: BundleResult) -> Certificate:
+    """Certify an adjustment.
+
+    Raises
+    ------
+    UnusableCalibrationError
+        If one more Newton step would move an unknown by more than its sigma, or the equations have no solution. The
+        message names the unknowns.
+    """
+    matrix, right = reduced_normal_equations(
+        problem, result.state.theta, result.information, result.gradient
+    )
+    sigmas = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))
+    scaled, _ = equilibrate(matrix)
+    values = np.linalg.eigvalsh(scaled) if np.all(np.isfinite(scaled)) else np.zeros(1)
+    names = [name for name in names_of(functions) for _ in range(functions[name].size)]
+    names += list(problem.shared)
+    if not (values[0] > 0.0 and np.all(np.isfinite(sigmas)) and np.all(sigmas > 0.0)):
+        weak = [
+            name for name, s in zip(names, sigmas, strict=True) if not (np.isfinite(s) and s > 0)
+        ]
+        raise UnusableCalibrationError(
+            "a fit whose equations have no solution",
+            expected=f"views that determine {', '.join(dict.fromkeys(weak)) or 'the camera'}",
+            do="record views with more tilt, at more magnifications",
+        )
+    remaining = np.abs(solve_scaled(matrix, right)) / sigmas
+    if float(remaining.max()) > _LARGEST_REMAINING:
+        worst = [names[k] for k in np.argsort(-remaining) if remaining[k] > _LARGEST_REMAINING]
+        raise UnusableCalibrationError(
+            f"a fit that is not at a minimum: {', '.join(list(dict.fromkeys(worst))[:_NAMED])} would still move by "
+            f"{remaining.max():.1f} sigma",
+            expected="views of one flat grid, by one microscope, at the magnifications that are stated",
+            do="leave out views that are not such, or record more",
+        )
+    held, start = [], 0
+    for name in names_of(functions):
+        prior = problem.prior_sigma[start]
+        if np.isfinite(prior) and result.covariance[start, start] > _HELD * prior**2:
+            held.append(name)
+        start += functions[name].size
+    return Certificate(
+        remaining_sigmas=float(remaining.max()),
+        last_decrease=max(result.last_decrease, 0.0),
+        condition=float(values[-1] / values[0]),
+        held=tuple(held),
+    )
+
+
+# Lengths of correlation that are tried, lines: hardly more than one line, that of one corner's window,
+# and multiples of it up to a quarter of a small image. Longer ones look like a drift.
+_LENGTHS = (0.4, 1.5, 6.0, 24.0)
+# Products of residuals are compared up to this many lines apart.
+_MOST_LAG = 64
+# Improvement in chi-squares below which there is no jitter: three standard deviations.
+_SIGNIFICANT = 9.0
+# Least sum of weights with which a lag is compared.
+_ENOUGH_PAIRS = 20.0
+
+
+@dataclass(frozen=True)
+class LineJitter:
+    """Covariance of the x errors of lines, as a sum of Gaussian functions of their distance.
+
+    Attributes
+    ----------
+    variance_px2
+        Variance of each part.
+    length_lines
+        Its length of correlation, lines.
+    """
+
+    variance_px2: tuple[float, ...] = ()
+    length_lines: tuple[float, ...] = ()
+
+    @property
+    def sigma_px(self) -> float:
+        """1-sigma of the whole jitter, px."""
+        return float(np.sqrt(sum(self.variance_px2)))
+
+    def covariance_px2(self, lag: Array) -> Array:
+        """Return the covariance at distances in lines."""
+        out = np.zeros(len(lag))
+        for variance, length in zip(self.variance_px2, self.length_lines, strict=True):
+            out += variance * np.exp(-0.5 * (lag / length) ** 2)
+        return out
+
+
+def _views(problem: Problem) -> Iterator[slice]:
+    for first, last in zip(problem.starts[:-1], problem.starts[1:], strict=True):
+        yield slice(int(first), int(last))
+
+
+def _lines(problem: Problem, part: slice) -> Indices:
+    """Return the line of each corner of a view, from 0; pixel centres are at whole numbers."""
+    line = np.round(problem.observed_px[part, 1]).astype(np.intp)
+    return np.asarray(line - line.min(), dtype=np.intp)
+
+
+def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
+    """Estimate the jitter from products of residuals of the same view.
+
+    The result is without parts where nothing significant is found.
+    """
+    product, pairs = np.zeros(_MOST_LAG), np.zeros(_MOST_LAG)
+    squares = 0.0
+    for part in _views(problem):
+        inlier = result.huber_weight[part] >= 1.0
+        x = np.where(inlier, result.residuals_px[part, 0], 0.0)
+        line = _lines(problem, part)
+        sums, counts = (np.bincount(line, weights=w) for w in (x, inlier.astype(float)))
+        own = min(len(sums), _MOST_LAG)
+        for k in range(own):
+            product[k] += sums[k:] @ sums[: len(sums) - k]
+            pairs[k] += counts[k:] @ counts[: len(counts) - k]
+        # A corner is no pair with itself; pairs on one line are counted twice.
+        product[0] -= x @ x
+        pairs[0] -= inlier.sum()
+        squares += float(x @ x)
+    product[0] *= 0.5
+    pairs[0] *= 0.5
+    known = pairs >= _ENOUGH_PAIRS
+    if not np.any(known):
+        return LineJitter()
+    lag = np.arange(_MOST_LAG)[known]
+    variance = squares / max(float(np.sum(result.huber_weight >= 1.0)), 1.0)
+    weight = np.sqrt(pairs[known]) / variance
+    target = product[known] / pairs[known] * weight
+    design = np.stack([np.exp(-0.5 * (lag / s) ** 2) for s in _LENGTHS], axis=1) * weight[:, None]
+    found, left = nnls(design, target)
+    if float(target @ target) - left**2 < _SIGNIFICANT:
+        return LineJitter()
+    parts = [(float(v), s) for v, s in zip(found, _LENGTHS, strict=True) if v > 0.0]
+    return LineJitter(tuple(v for v, _ in parts), tuple(s for _, s in parts))
+
+
+def jitter_covariance(problem: Problem, result: BundleResult, jitter: LineJitter) -> Array:
+    """Return the (K, K) covariance of theta that the correlation of lines adds.
+
+    ``result`` is the adjustment of ``problem``, at its optimum.
+    """
+    state = result.state
+    size = len(state.theta)
+    if not jitter.variance_px2:
+        return np.zeros((size, size))
+    normal = normal_equations(problem, state)
+    reduced = schur_complement(problem, state, normal, 0.0)
+    matrix, _ = reduced_normal_equations(
+        problem, state.theta, reduced.information, reduced.gradient
+    )
+    corners = corner_rows(problem, state)
+    inner = problem.layout.view.start
+    columns = corners.columns[:-1]
+    meat = np.zeros((size, size))
+    kernel = np.zeros((0, 0))
+    for v, part in enumerate(_views(problem)):
+        xx, yx, _ = problem.whitening[part].T * np.sqrt(corners.huber_weight[part])
+        rows = corners.rows[:, :-1, part]
+        score = np.zeros((problem.layout.size, rows.shape[2]))
+        score[columns] = rows[0] * xx + rows[1] * yx
+        # What a shift of each corner along x does to the theta of the optimum.
+        outer = score[:inner] - reduced.pose_by_rest[v].T @ score[inner:]
+        if problem.effects is not None:
+            own = reduced.visit_by_rest[problem.effects.visit[v]]
+            first = problem.layout.visit.start
+            outer = outer[:first] - own.T @ outer[first:]
+        pull = problem.designs[problem.group[v]].T @ outer
+        line = _lines(problem, part)
+        count = int(line.max()) + 1
+        by_line = np.zeros((count, size))
+        np.add.at(by_line, line, pull.T)
+        if len(kernel) < count:
+            kernel = toeplitz(jitter.covariance_px2(np.arange(count, dtype=np.float64)))
+        own_variance = float(jitter.covariance_px2(np.zeros(1))[0])
+        # A corner's own variance is among the noise already.
+        meat += by_line.T @ kernel[:count, :count] @ by_line - own_variance * pull @ pull.T
+    half = solve_scaled(matrix, meat)
+    added = solve_scaled(matrix, half.T)
+    return _positive_part(0.5 * (added + added.T))
+
+
+def _positive_part(matrix: Array) -> Array:
+    """Return the nearest matrix without negative eigenvalues, in units of its diagonal."""
+    scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
+
 
 # Number of zero coefficients that are added to the chosen ones, and the least number in all: what
 # the views leave open of them enters the covariance.

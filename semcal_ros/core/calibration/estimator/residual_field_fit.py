@@ -30,10 +30,12 @@ from scipy.linalg import cho_factor, cho_solve
 
 from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, variance_factor
 from semcal_ros.core.calibration.estimator.normal_equations import sum_by
-from semcal_ros.core.calibration.estimator.priors import REFERENCE_WIDTH_PX, Setup
-from semcal_ros.core.calibration.estimator.problem import variance_factor
+from semcal_ros.core.calibration.estimator.problem import (
+    REFERENCE_WIDTH_PX,
+    Setup,
+)
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
     stack_rows,
@@ -46,6 +48,8 @@ from semcal_ros.core.errors import UnusableCalibrationError
 __all__ = [
     "FieldChoice",
     "FieldSystem",
+    "FittedField",
+    "GridPattern",
     "blank_field",
     "choose_field",
     "field_system",
@@ -419,3 +423,41 @@ def solve_field(
     solution = system.solve(every if keep is None else keep, prior)
     theta, coefficients = np.split(solution, [system.designs.shape[2]])
     return theta, replace(blank, coefficients=coefficients.reshape(blank.coefficients.shape))
+
+
+@dataclass(frozen=True)
+class FittedField:
+    """The residual field of a :class:`JointFit`.
+
+    Attributes
+    ----------
+    field
+        The field itself.
+    choice
+        Its strength, and the result of cross-validation.
+    system
+        The reduced system at the solution, from which magnifications can be left out.
+    converged
+        Whether camera and field stopped changing.
+    """
+
+    field: ResidualField
+    choice: FieldChoice
+    system: FieldSystem
+    converged: bool
+
+
+@dataclass(frozen=True)
+class GridPattern:
+    """Displacements of the corners that turn with the grid: it is not regular.
+
+    Attributes
+    ----------
+    system
+        The reduced system with the pattern as unknowns.
+    choice
+        Its strength, and the result of cross-validation.
+    """
+
+    system: FieldSystem
+    choice: FieldChoice

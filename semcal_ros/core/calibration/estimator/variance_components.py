@@ -24,7 +24,7 @@ so that a spread which the views do not determine stays at its usual value.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import nnls
@@ -32,15 +32,16 @@ from scipy.optimize import nnls
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.priors import Priors, Setup
+from semcal_ros.core.calibration.estimator.problem import (
+    Priors,
+    Setup,
+    Spread,
+    VarianceComponents,
+    initial_components,
+    usual_lattice_sigmas,
+)
 
-__all__ = [
-    "Spread",
-    "VarianceComponents",
-    "initial_components",
-    "limit_components",
-    "update_components",
-]
+__all__ = ["limit_components", "update_components"]
 
 # Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
 # mount, less than tilts that are set on purpose.
@@ -51,74 +52,6 @@ _ENOUGH_HEIGHTS = 4
 _WEIGHT_OF_USUAL = 0.05
 # Limits of a spread, relative to its usual value. Below the lower one, no view can show it.
 _LEAST, _MOST = 0.01, 20.0
-
-
-@dataclass(frozen=True)
-class Spread:
-    """A standard deviation, and how well it is known.
-
-    Attributes
-    ----------
-    sigma
-        The standard deviation.
-    determined
-        How many of the effects the data determine; the relative 1-sigma of ``sigma`` is
-        ``1 / sqrt(2 determined)``.
-    visible
-        How many of them the data would determine if the spread were the usual one: few where the
-        data say nothing about the spread, and many where they say that it is small.
-    """
-
-    sigma: float
-    determined: float
-    visible: float = 0.0
-
-    @property
-    def sigma_of_sigma(self) -> float:
-        """1-sigma of ``sigma``; infinite where the data say nothing."""
-        return self.sigma / np.sqrt(2.0 * self.determined) if self.determined > 0.0 else np.inf
-
-
-@dataclass(frozen=True)
-class VarianceComponents:
-    """Spread of all random effects.
-
-    Attributes
-    ----------
-    scale
-        Relative scale of a visit.
-    visit_height
-        Height that the views of a visit share, m.
-    height_sigma_m
-        (V,) height of each view, m.
-    drift_sigma_px
-        (V,) drift within each image, px per axis.
-    lattice_sigma
-        (2,) stretch and shear of the grid in the lattice of a view, which has one of four
-        directions by chance; None where the stage's rotation tells which.
-    """
-
-    scale: Spread
-    visit_height: Spread
-    height_sigma_m: Array
-    drift_sigma_px: Array
-    lattice_sigma: Array | None = None
-
-
-def initial_components(setup: Setup) -> VarianceComponents:
-    """Return the usual spreads."""
-    count, priors = len(setup.views), setup.priors
-    return VarianceComponents(
-        Spread(priors.visit_scale_sigma, 0.0),
-        Spread(priors.visit_height_sigma_m, 0.0),
-        np.full(count, priors.height_sigma_m),
-        np.full(count, setup.drift_sigma_px),
-        None if setup.is_rotation_known else _usual_lattice(priors),
-    )
-
-
-def _usual_lattice(priors: Priors) -> Array:
-    return np.array([priors.grid_stretch_sigma, priors.grid_shear_sigma])
 
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
@@ -213,7 +146,7 @@ def _lattice_sigma(sigma: Array | None, result: BundleResult, priors: Priors) ->
     return np.array(
         [
             _update(s, usual, residuals[:, k], variance[:, k]).sigma
-            for k, (s, usual) in enumerate(zip(sigma, _usual_lattice(priors), strict=True))
+            for k, (s, usual) in enumerate(zip(sigma, usual_lattice_sigmas(priors), strict=True))
         ]
     )
 

@@ -34,7 +34,7 @@ from scipy.stats import chi2, norm
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.priors import Setup
+from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.judgement.revision import (
     CHANGING,
     Revision,

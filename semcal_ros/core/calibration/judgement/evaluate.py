@@ -28,8 +28,8 @@ import numpy as np
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices
 from semcal_ros.core.calibration.estimator.blocks import State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA
-from semcal_ros.core.calibration.initial_values import pose_from_camera
+from semcal_ros.core.calibration.estimator.poses import pose_from_camera
+from semcal_ros.core.calibration.estimator.problem import HELD_SIGMA
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera

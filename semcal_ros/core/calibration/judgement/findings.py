@@ -12,30 +12,209 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a reader should know before trusting a calibration."""
+"""What a reader should know before trusting a calibration: what its views cover, and what their residuals show."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.coverage import (
-    compute_empty_share,
-    compute_reached_shares,
-    compute_tilts_deg,
-)
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.judgement.finding import Finding, rank_findings
-from semcal_ros.core.calibration.residual_pattern import estimate_pattern_px
-from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.core.calibration.method_fit import Finding, rank_findings
+from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
+from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = ["find_all", "find_weaknesses"]
+__all__ = [
+    "Cells",
+    "ViewCoverage",
+    "assign_cells",
+    "compute_empty_share",
+    "compute_reached_shares",
+    "compute_tilts_deg",
+    "concatenate_corners",
+    "estimate_pattern_px",
+    "estimate_tilt_deg",
+    "find_all",
+    "find_weaknesses",
+    "measure_view_coverage",
+    "normalise_residuals",
+]
+
+# Cells across the field. At the lowest magnifications a square of the grid is smaller than one of them; at the
+# highest, a view has some tens of corners, and a few views fill them.
+_ACROSS = 8
+
+
+@dataclass(frozen=True)
+class ViewCoverage:
+    """What views cover.
+
+    Attributes
+    ----------
+    field_share
+        Share of the cells of the field that have a corner in at least one view; 0 without views.
+    tilts_deg
+        Tilt of the grid in each view: what the stage says, else as :func:`estimate_tilt_deg`.
+    views
+        Number of views at each magnification, in ascending order.
+    """
+
+    field_share: float
+    tilts_deg: tuple[float, ...]
+    views: dict[float, int]
+
+
+def estimate_tilt_deg(detection: LatticeDetection) -> float:
+    """Estimate the tilt of a square grid from how much shorter it is in one direction, degrees.
+
+    An aspect of the pixels of 1 % looks like 8 degrees, so this tells large tilts from small ones only.
+    """
+    ij = detection.ij - detection.ij.mean(axis=0)
+    map_from_lattice = np.linalg.lstsq(
+        ij.astype(np.float64), detection.xy - detection.xy.mean(axis=0), rcond=None
+    )[0]
+    longer, shorter = np.linalg.svd(map_from_lattice, compute_uv=False)
+    return math.degrees(math.acos(min(float(shorter / longer), 1.0)))
+
+
+def _filled(detection: LatticeDetection, rows: int) -> Array:
+    width, height = detection.image_size
+    cells = np.floor((detection.xy + 0.5) / np.array([width / _ACROSS, height / rows]))
+    column, row = np.clip(cells.astype(np.intp), 0, [_ACROSS - 1, rows - 1]).T
+    filled = np.zeros((rows, _ACROSS), dtype=np.float64)
+    filled[row, column] = 1.0
+    return filled
+
+
+def measure_view_coverage(views: Sequence[FoundView]) -> ViewCoverage:
+    """Measure what views of one microscope cover.
+
+    Parameters
+    ----------
+    views
+        Of any magnifications. Their images should have one shape; where they have not, the shape of the first counts.
+    """
+    if not views:
+        return ViewCoverage(0.0, (), {})
+    width, height = views[0].detection.image_size
+    rows = max(1, round(_ACROSS * height / width))
+    filled = np.max([_filled(view.detection, rows) for view in views], axis=0)
+    tilts = []
+    for view in views:
+        told = None if view.stage is None else view.stage.tilt_rad
+        tilts.append(estimate_tilt_deg(view.detection) if told is None else math.degrees(told))
+    counts = Counter(float(view.magnification) for view in views)
+    return ViewCoverage(float(np.mean(filled)), tuple(tilts), dict(sorted(counts.items())))
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A lattice of nearly square cells over the field, and the cell of every corner."""
+
+    columns: int
+    rows: int
+    index: Indices
+    centres: Array
+
+    @property
+    def counts(self) -> Indices:
+        """(columns * rows,) number of corners in each cell."""
+        return np.bincount(self.index, minlength=self.columns * self.rows)
+
+
+def compute_empty_share(result: CalibrationResult, across: int = 12) -> float:
+    """Compute the share of cells without a corner, with ``across`` cells across the field."""
+    counts = assign_cells(result, np.concatenate([v.image_xy for v in result.views]), across).counts
+    return float(np.mean(counts == 0))
+
+
+def assign_cells(result: CalibrationResult, xy: Array, across: int) -> Cells:
+    """Divide the field, ``across`` cells wide, and assign each pixel ``xy`` to a cell."""
+    width, height = result.model.image_size
+    rows = max(1, round(across * height / width))
+    size = np.array([width / across, height / rows])
+    ij = np.floor((xy + 0.5) / size).astype(np.intp)
+    ij = np.clip(ij, 0, [across - 1, rows - 1])
+    j, i = np.mgrid[0:rows, 0:across]
+    centres = (np.stack([i.ravel(), j.ravel()], axis=1) + 0.5) * size - 0.5
+    return Cells(across, rows, ij[:, 1] * across + ij[:, 0], centres)
+
+
+def compute_reached_shares(result: CalibrationResult, across: int = 6) -> dict[float, float]:
+    """Compute, for each magnification, the share of cells, ``across`` in a row, with a corner."""
+    xy: dict[float, list[Array]] = {}
+    for view in result.views:
+        xy.setdefault(float(view.magnification), []).append(view.image_xy)
+    return {
+        g: float(np.mean(assign_cells(result, np.concatenate(own), across).counts > 0))
+        for g, own in sorted(xy.items())
+    }
+
+
+def concatenate_corners(result: CalibrationResult) -> tuple[Array, Array]:
+    """Concatenate all corners (n, 2) and their residuals (n, 2), px."""
+    return (
+        np.concatenate([v.image_xy for v in result.views]),
+        np.concatenate(result.fit.residuals_px),
+    )
+
+
+def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
+    """Compute the tilt of the grid in each view, and the direction of its normal, degrees."""
+    normals = result.fit.rotations[:, :, 2]
+    upright = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
+    tilt = np.degrees(np.arccos(np.clip(upright[:, 2], -1.0, 1.0)))
+    return tilt, np.degrees(np.arctan2(upright[:, 1], upright[:, 0]))
+
+
+# Cells across the field for the test: larger than in the figure, so that their means are less
+# noisy.
+_PATTERN_CELLS = 8
+# With fewer corners a cell is left out.
+_MIN_IN_CELL = 5
+
+
+def normalise_residuals(result: CalibrationResult) -> Array:
+    """Divide residuals (n, 2) by the 1-sigma of their corners."""
+    sigma = np.concatenate([v.sigma_px for v in result.views])
+    return np.asarray(np.concatenate(result.fit.residuals_px) / sigma[:, None], dtype=np.float64)
+
+
+def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
+    """Estimate the size in px of a pattern in the residuals, and its ratio to chance.
+
+    The ratio compares the squares of the cells' weighted mean residuals with what independent
+    corners of the same spread would give; 1 is pure chance.
+    """
+    xy, residuals = concatenate_corners(result)
+    weights = np.concatenate([v.sigma_px for v in result.views]) ** -2.0
+    cells = assign_cells(result, xy, _PATTERN_CELLS)
+    size = cells.columns * cells.rows
+    enough = cells.counts >= _MIN_IN_CELL
+    if not np.any(enough):
+        return 0.0, 1.0
+    total = np.bincount(cells.index, weights, size)[enough]
+    sums = np.stack(
+        [np.bincount(cells.index, weights * residuals[:, k], size)[enough] for k in (0, 1)], axis=1
+    )
+    # The median is robust; 0.6745 is the median absolute value of a standard normal variable.
+    spread = float(np.median(np.abs(normalise_residuals(result)))) / 0.6745
+    chance = spread**2 / total
+    squares = np.sum((sums / total[:, None]) ** 2, axis=1)
+    excess = float(np.mean(squares - 2.0 * chance))
+    if not np.all(chance > 0.0):
+        return 0.0, 1.0
+    return float(np.sqrt(max(excess, 0.0))), float(np.mean(squares / (2.0 * chance)))
+
 
 # Part of the field without a corner that is worth a warning: about 5 of 108 cells of a 4:3 image.
 _EMPTY_SHARE = 0.05

@@ -30,10 +30,13 @@ from scipy.special import ndtr, stdtrit
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    BundleResult,
+    refine,
+    variance_factor,
+)
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
-from semcal_ros.core.calibration.estimator.priors import Setup
-from semcal_ros.core.calibration.estimator.problem import variance_factor
+from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import whitened_norm
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection

@@ -28,26 +28,27 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
-from semcal_ros.core.calibration.estimator.line_jitter import estimate_jitter, jitter_covariance
-from semcal_ros.core.calibration.estimator.poses import adjust
-from semcal_ros.core.calibration.estimator.priors import HELD_SIGMA, Priors, Setup
-from semcal_ros.core.calibration.estimator.problem import (
-    build_problem,
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    BundleResult,
+    refine,
     variance_factor,
-    with_shared,
 )
-from semcal_ros.core.calibration.estimator.variance_components import (
+from semcal_ros.core.calibration.estimator.poses import adjust
+from semcal_ros.core.calibration.estimator.posterior import estimate_jitter, jitter_covariance
+from semcal_ros.core.calibration.estimator.problem import (
+    HELD_SIGMA,
+    Priors,
+    Setup,
     Spread,
     VarianceComponents,
+    build_problem,
     initial_components,
-    update_components,
+    with_shared,
 )
-from semcal_ros.core.calibration.grid_orientation import align_lattices
+from semcal_ros.core.calibration.estimator.variance_components import update_components
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.start import add_shared_unknowns
-from semcal_ros.core.calibration.untilted import mark_untilted
+from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices, mark_untilted
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,

@@ -24,8 +24,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.priors import Setup
-from semcal_ros.core.calibration.judgement.finding import Finding
+from semcal_ros.core.calibration.estimator.problem import Setup
+from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 

@@ -23,16 +23,15 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
-from semcal_ros.core.calibration.estimator.priors import Setup
-from semcal_ros.core.calibration.estimator.problem import Functions
+from semcal_ros.core.calibration.estimator.problem import Functions, Setup
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.method_fit import MethodFit, make_model
 from semcal_ros.core.calibration.options import MethodOptions
 from semcal_ros.core.calibration.paper.discrete import DiscreteFit, fit_discrete, table_functions
-from semcal_ros.core.calibration.paper.pda import pda_functions
-from semcal_ros.core.calibration.paper.pda_step import (
+from semcal_ros.core.calibration.paper.pda import (
     StepTrial,
     choose_step,
+    pda_functions,
     select_magnifications,
     try_steps,
 )
