@@ -290,7 +290,7 @@ def _moves(
     for name, limit in limits.items():
         kind, size = sizes[name]
         least = 0 if name in terms else 1
-        for other in _POLYNOMIALS[:1] if name in terms else _POLYNOMIALS:
+        for other in _POLYNOMIALS[:1] if name in SCAN_NAMES else _POLYNOMIALS:
             for change in (-1, 0, 1, 2):
                 option = (other, size + change)
                 if least <= option[1] <= limit and option != (kind, size):
