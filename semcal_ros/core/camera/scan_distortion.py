@@ -37,6 +37,7 @@ time, and remove it; they do not model its cause.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -80,9 +81,10 @@ ALONG_COUNT = 9
 """How many of them are along the lines."""
 # Beyond the picture the functions go on as straight lines.
 _END = 1.0
-# Newton's method converges quadratically; a function as steep as it may be takes five steps.
+# Newton's method converges quadratically; a function as steep as it may be takes five steps. A last step as long as
+# this leaves 1e-9 px where the settling is the quickest and as steep as it may be, and much less elsewhere.
 _MAX_STEPS = 30
-_TOLERANCE = 1e-12
+_LAST_STEP = 1e-7
 _LARGEST_SLOPE = 0.9
 
 
@@ -191,7 +193,7 @@ def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
         own = _amplitudes(amplitudes, axis)
         if np.any(own):
             u = (xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis)
-            out[:, axis] = raster.norm_px * _Curve.of(own).value(u)[0]
+            out[:, axis] = raster.norm_px * _make_curve(own).value(u)[0]
     return out
 
 
@@ -218,7 +220,7 @@ def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) ->
 
 def _invert(target: Array, own: Array, raster: Raster, axis: int) -> Array:
     scale = _scale(raster, axis)
-    curve = _Curve.of(own)
+    curve = _make_curve(own)
     # In half pictures of this axis.
     goal, part = (target - raster.middle_px[axis]) / scale, raster.norm_px / scale
     u = goal - part * curve.value(goal)[0]
@@ -229,7 +231,7 @@ def _invert(target: Array, own: Array, raster: Raster, axis: int) -> Array:
             stretch > 1.0 - _LARGEST_SLOPE, stretch, np.nan
         )
         u = u - change
-        late = np.abs(change) > _TOLERANCE
+        late = np.abs(change) > _LAST_STEP
         if not np.any(late):
             return raster.middle_px[axis] + scale * u
     return np.where(late, np.nan, raster.middle_px[axis] + scale * u)
@@ -250,18 +252,6 @@ class _Curve:
     powers: Array
     decays: tuple[tuple[Array, float], ...]
 
-    @classmethod
-    def of(cls, own: Array) -> _Curve:
-        polynomials = len(_POWERS)
-        powers = np.tensordot(_POWERS, own[:polynomials], axes=(0, 0))
-        decays = []
-        for amplitude, line, rate in zip(own[polynomials:], _LINES, _RATES, strict=False):
-            if np.any(amplitude):
-                powers[0] -= amplitude * line[0]
-                powers[1] -= amplitude * line[1]
-                decays.append((amplitude, float(rate)))
-        return cls(powers, tuple(decays))
-
     def value(self, u: Array) -> tuple[Array, Array]:
         """Return the value and the slope at ``u`` (n,); a straight line beyond the picture."""
         inside = np.clip(u, -_END, _END)
@@ -276,6 +266,29 @@ class _Curve:
             value += decay
             slope += rate * decay
         return value + slope * (u - inside), slope
+
+
+def _make_curve(own: Array) -> _Curve:
+    """Return the sum of the functions of an axis with amplitudes (k, 1), or with some for each point, (k, n)."""
+    return _kept_curve(own.tobytes()) if own.shape[1] == 1 else _sum_functions(own)
+
+
+@lru_cache(maxsize=64)
+def _kept_curve(own: bytes) -> _Curve:
+    # A live camera asks for the same ones several times a frame.
+    return _sum_functions(np.frombuffer(own)[:, None])
+
+
+def _sum_functions(own: Array) -> _Curve:
+    polynomials = len(_POWERS)
+    powers = np.tensordot(_POWERS, own[:polynomials], axes=(0, 0))
+    decays = []
+    for amplitude, line, rate in zip(own[polynomials:], _LINES, _RATES, strict=False):
+        if np.any(amplitude):
+            powers[0] -= amplitude * line[0]
+            powers[1] -= amplitude * line[1]
+            decays.append((amplitude, float(rate)))
+    return _Curve(powers, tuple(decays))
 
 
 def linearise_scan(raw: Array, amplitudes: Array, raster: Raster) -> ScanDerivatives:
