@@ -286,9 +286,13 @@ def _fit_without_outliers(
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
             for v, rejection in found.items()
         ]
-        # At least two views of every magnification stay, so this loop ends.
+        # Fewer views at every turn, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
-        setup = replace(setup, views=views)
+        if not views:
+            return fit, setup, tuple(outliers), notes
+        # A magnification of which no view is left is not calibrated.
+        magnifications = np.unique([v.magnification for v in views])
+        setup = replace(setup, views=views, magnifications=magnifications)
 
 
 def _propose_untilted(setup: Setup, joint: JointFit, fit: MethodFit) -> list[Finding]:
