@@ -35,11 +35,12 @@ changes along the rows, which were scanned in an instant.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
+from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.errors import Rejection
@@ -67,7 +68,9 @@ from semcal_ros.core.registration.tiles import (
 __all__ = [
     "Alignment",
     "SimilarityFit",
+    "TileStatistics",
     "align",
+    "align_reweighted",
     "tile_residual_energies",
     "unmeasured_alignment",
 ]
@@ -76,6 +79,16 @@ __all__ = [
 # A start that needs more steps than these is outside the range of convergence.
 _MAX_PASSES = 12
 _MAX_COARSE_PASSES = 4
+# The number of scores that count is itself uncertain where it is small.
+_LEAST_FREEDOM = 8.0
+# Fewer than this make up most of the information only where it lies in lone particles.
+_FEW_SCORES = 12.0
+# Probability below three standard deviations.
+_THREE_SIGMAS = 0.99865
+# Less of a gain is that of another place.
+_LEAST_GAIN = 0.3
+# Passes in which the weights of tiles may change.
+_MAX_REWEIGHTED = 8
 # The gradient extrapolates over a pixel or two of a sharp image; longer steps may overshoot.
 _MAX_STEP_PX = 1.5
 # A coarse level is left when its step is this short (px of the level), less than half a pixel of
@@ -192,6 +205,11 @@ class Alignment:
         comparison = self._comparison
         return None if comparison is None else _fit_similarity(comparison)
 
+    def tile_statistics(self) -> TileStatistics | None:
+        """What each tile shows at the shift; None where nothing was compared."""
+        comparison = self._comparison
+        return None if comparison is None else _measure_tiles(comparison)
+
     def row_power(self, modes: int) -> Array | None:
         """(2, k, 2) power of the shifts of the rows of tiles about a straight line, px^2 per row, in the
         lowest cosine modes down the frame, k = ``modes`` or as many as there are rows for; and the same of
@@ -199,6 +217,86 @@ class Alignment:
         """
         comparison = self._comparison
         return None if comparison is None else _measure_row_power(comparison, modes)
+
+
+@dataclass(frozen=True)
+class TileStatistics:
+    """Tiles of a reference beside what the image shows there, after smoothing and without the mean of each tile.
+
+    Attributes
+    ----------
+    rows, cols
+        The tiles of the reference that are compared.
+    pixels
+        Number of pixels of a tile.
+    sigma_px
+        Width of the smoothing.
+    reference, image, common
+        (rows, cols) sums of squares of the reference and of the image, and of their products.
+    gain
+        (rows, cols) image grey levels per reference grey level.
+    gradient
+        (rows, cols, 2, 2) sums of products of the reference's gradients.
+    scores
+        (rows, cols, 2) products of the gradient with what gain and offset leave.
+    """
+
+    rows: slice
+    cols: slice
+    pixels: float
+    sigma_px: float
+    reference: Array
+    image: Array
+    common: Array
+    gain: Array
+    gradient: Array
+    scores: Array
+
+
+def _measure_tiles(comparison: _Comparison) -> TileStatistics:
+    gain = comparison.geometry.ramps @ comparison.fit.gain
+    return _make_statistics(comparison.level, comparison.window, comparison.plain, gain)
+
+
+def _make_statistics(
+    level: PyramidLevel, window: TileWindow, sums: TileSums, gain: Array
+) -> TileStatistics:
+    own, cross = level.normal_matrices[window.rows, window.cols], sums.cross
+    pixels, shape = float(own[0, 0, 3, 3]), own.shape[:2]
+    gain = gain.reshape(shape)
+    # The offset of each tile is its own: charging and shading say nothing of the shift.
+    offset = (cross[..., 3] - gain * own[..., 2, 3]) / pixels
+    residual = (
+        cross[..., :2] - gain[..., None] * own[..., :2, 2] - offset[..., None] * own[..., :2, 3]
+    )
+    return TileStatistics(
+        window.rows,
+        window.cols,
+        pixels,
+        level.sigma_px,
+        own[..., 2, 2] - own[..., 2, 3] ** 2 / pixels,
+        sums.energy - cross[..., 3] ** 2 / pixels,
+        cross[..., 2] - own[..., 2, 3] * cross[..., 3] / pixels,
+        gain,
+        own[..., :2, :2],
+        residual,
+    )
+
+
+def _look_at_tiles(level: PyramidLevel, image: Pyramid, shift: Array) -> TileStatistics | None:
+    """The tiles at a shift in px of the level, before anything is fitted there, with the gain of the median tile."""
+    pixels = image.centred(level.factor)
+    window = tile_window(level, (pixels.shape[1], pixels.shape[0]), shift)
+    if window is None:
+        return None
+    sums = tile_sums(level, window, pixels, shift, np.zeros((2, 2)))
+    tiles = _make_statistics(level, window, sums, np.ones(len(window.y) * len(window.x)))
+    rich = tiles.reference >= np.median(tiles.reference)
+    ratios = tiles.common[rich] / np.maximum(tiles.reference[rich], 1e-30)
+    # What came in has nothing in common with what it covers.
+    ratios = ratios[ratios > _LEAST_GAIN]
+    gains = np.full(tiles.gain.size, float(np.median(ratios)) if len(ratios) else 1.0)
+    return _make_statistics(level, window, sums, gains)
 
 
 def unmeasured_alignment() -> Alignment:
@@ -225,12 +323,16 @@ def unmeasured_alignment() -> Alignment:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """The pixels of one level compared at one shift; shifts in px of the level."""
+    """The pixels of one level compared at one shift; shifts in px of the level.
+
+    ``plain`` are the sums without weights of the tiles.
+    """
 
     level: PyramidLevel
     window: TileWindow
     geometry: TileGeometry
     sums: TileSums
+    plain: TileSums
     fit: TileFit
     shift: Array
     image_size: tuple[int, int]
@@ -312,15 +414,79 @@ def _align(
     return chance or _summarise(comparison, covariance, converged, passes)
 
 
+def align_reweighted(
+    level: PyramidLevel,
+    image: Pyramid,
+    start_px: Array,
+    weights: Array,
+    noise: float,
+    reweight: Callable[[TileStatistics], Array],
+) -> Alignment | Rejection[MatchFailure]:
+    """Refine a shift by those tiles that agree with it.
+
+    Parameters
+    ----------
+    level
+        The reference at full resolution.
+    image
+        The image.
+    start_px
+        (2,) shift, right to about a pixel.
+    weights
+        (rows, cols) first weights of the reference's tiles.
+    noise
+        Variance of its noise per pixel, after smoothing.
+    reweight
+        From the statistics of the compared tiles to their weights.
+
+    Returns
+    -------
+    The alignment, which may not have converged; or a rejection as of :func:`align`.
+    """
+    shift, passes = np.asarray(start_px, dtype=np.float64), 0
+    weights, converged = weights.copy(), False
+    # A bright tool would pull the first step to where it went, or leave none.
+    first = _look_at_tiles(level, image, shift / level.factor)
+    if first is not None:
+        found = reweight(first)
+        if np.count_nonzero(found) >= _MIN_BLOCKS:
+            weights[first.rows, first.cols] = found
+    for passes in range(1, _MAX_PASSES + 1):
+        comparison = _compare(level, image, shift / level.factor, None, ALL_PIXELS, weights, noise)
+        if isinstance(comparison, Rejection):
+            return comparison
+        statistics = _measure_tiles(comparison)
+        found = reweight(statistics)
+        shift = comparison.improved * level.factor
+        before = weights[statistics.rows, statistics.cols]
+        is_same = bool(np.array_equal(found, before))
+        covariance = _covariance(comparison)
+        sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
+        remaining = _CONTRACTION * comparison.length + _CURVATURE * comparison.length**2
+        converged = remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
+        if converged and (is_same or passes >= _MAX_REWEIGHTED):
+            break
+        if passes < _MAX_REWEIGHTED or not converged:
+            weights[statistics.rows, statistics.cols] = found
+    assert isinstance(comparison, _Comparison)
+    information = comparison.fit.information
+    chance = _find_chance_gradient(comparison.level, comparison.geometry, information, ALL_PIXELS)
+    return chance or _summarise(comparison, covariance, converged, passes)
+
+
 def _compare(
     level: PyramidLevel,
     image: Pyramid,
     shift: Array,
     hessian: Array | None,
     enough: int = HESSIAN_PIXELS,
+    weights: Array | None = None,
+    noise: float = 0.0,
 ) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
-    comparison, None to compute it from enough pixels."""
+    comparison, None to compute it from enough pixels. ``weights`` (rows, cols) are those of the reference's tiles, and
+    ``noise`` the variance of its smoothed pixels.
+    """
     pixels = image.centred(level.factor)
     size = pixels.shape[1], pixels.shape[0]
     window = tile_window(level, size, shift)
@@ -328,15 +494,20 @@ def _compare(
         shared = _overlap_fraction(level.size, size, shift)
         reason = f"too little overlap ({100.0 * shared:.0f} % of the image)"
         return Rejection(MatchFailure.TOO_LITTLE_OVERLAP, reason)
-    geometry = prepare_geometry(level, window)
-    sums = tile_sums(level, window, pixels, shift, hessian, enough)
+    if weights is not None:
+        weights = weights[window.rows, window.cols]
+    geometry = prepare_geometry(level, window, weights, noise)
+    sums = tile_sums(level, window, pixels, shift, hessian, enough, weights)
+    plain = sums
+    if weights is not None:
+        sums = sums.weighted(weights, sums.hessian)
     fit = solve_step(geometry, sums)
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
         return _find_chance_gradient(level, geometry, information, enough) or Rejection(
             MatchFailure.UNDETERMINED, _FEATURELESS
         )
-    return _Comparison(level, window, geometry, sums, fit, shift, size, image.mean)
+    return _Comparison(level, window, geometry, sums, plain, fit, shift, size, image.mean)
 
 
 def _find_chance_gradient(
@@ -344,7 +515,7 @@ def _find_chance_gradient(
 ) -> Rejection[MatchFailure] | None:
     """Reject images that have no more gradient in common than chance gives, in one direction or all."""
     energy = geometry.total[:2, :2] * np.outer(geometry.gradient_share, geometry.gradient_share)
-    pixels = min(float(geometry.total[3, 3]), float(enough))
+    pixels = max(min(float(geometry.total[3, 3]), float(enough)), 1.0)
     # Smoothed noise has fewer independent pixels.
     chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
     values, vectors = np.linalg.eigh(information)
@@ -387,7 +558,8 @@ def _robust_covariance(comparison: _Comparison, scores: Array, inverse: Array) -
     """Covariance from the scatter of blocks, and of whole rows of tiles where that is clearly
     larger: lines of a scan may be shifted or shaded as a whole.
     """
-    covariance = _sandwich_covariance(_sum_blocks(comparison, scores), inverse)
+    blocks = _sum_blocks(comparison, scores)
+    covariance = _sandwich_covariance(blocks, inverse) * _widen_few(blocks, inverse)
     cols = comparison.window.cols.stop - comparison.window.cols.start
     rows = scores.reshape(-1, cols, scores.shape[1]).sum(axis=1)
     if len(rows) < _MIN_NOISE_ROWS:
@@ -404,6 +576,20 @@ def _sandwich_covariance(blocks: Array, inverse: Array) -> Array:
     centred = blocks - blocks.mean(axis=0)
     spread = centred.T @ centred * count / max(count - estimated, 1)
     return np.asarray(inverse @ spread @ inverse.T)
+
+
+def _widen_few(blocks: Array, inverse: Array) -> float:
+    """By how much the covariance of scores is larger where a few of them, as of lone particles, make up most of it.
+
+    Three sigmas then hold as of a Gaussian, although the sigma is that of few scores (Student's t).
+    """
+    squares = np.einsum("bi,bi->b", blocks @ inverse, blocks)
+    count = float(squares.sum() ** 2 / max(float(squares @ squares), 1e-300))
+    if count >= _FEW_SCORES:
+        return 1.0
+    freedom = max(count - blocks.shape[1], _LEAST_FREEDOM)
+    few = blocks.shape[1] / freedom - blocks.shape[1] / max(len(blocks), 1)
+    return (float(stdtrit(freedom, _THREE_SIGMAS)) / 3.0) ** 2 * (1.0 + max(few, 0.0))
 
 
 def _summarise(

@@ -40,6 +40,7 @@ __all__ = [
     "estimate_noise_variance",
     "gaussian_taps",
     "measure_image",
+    "measure_richest_parts",
     "smooth",
 ]
 
@@ -48,6 +49,8 @@ __all__ = [
 # corners of the spectrum of 64 px have some 300 coefficients, which tell the noise to 8 %.
 _CROP_PX = 256
 _NOISE_CROP_PX = 64
+# Side of the parts of a sparse image, and how many of them count.
+_PART_PX, _RICHEST = 32, 4
 # Rings of the spectrum, out to its corners.
 _BINS = 48
 # Widths of the Gaussian to choose from: in steps of 12 %, over which the variance is flat.
@@ -132,6 +135,37 @@ def estimate_noise_variance(image: AnyImage) -> float:
     crop = (crop - float(np.vdot(crop, weights))) * window
     noise = scipy.fft.rfft2(crop).take(corners)
     return float(np.vdot(noise, noise).real) / (len(corners) * energy)
+
+
+def measure_richest_parts(
+    image: AnyImage, averaged: float = 1.0, raw: AnyImage | None = None
+) -> ImageStatistics:
+    """The same as :func:`measure_image` of those parts of a sparse image that show most, put side by side."""
+    height, width = image.shape
+    steps = [np.arange(0, n - _PART_PX + 1, _PART_PX // 2) for n in (height, width)]
+    places = [(int(y), int(x)) for y in steps[0] for x in steps[1]]
+    small = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
+    variances = [float(small[y : y + _PART_PX, x : x + _PART_PX].var()) for y, x in places]
+    richest = [places[k] for k in np.argsort(variances)[::-1]]
+    chosen: list[tuple[int, int]] = []
+    for y, x in richest:
+        if all(max(abs(y - b), abs(x - a)) >= _PART_PX for b, a in chosen):
+            chosen.append((y, x))
+        if len(chosen) == _RICHEST:
+            break
+    found = [
+        measure_image(
+            image[y : y + _PART_PX, x : x + _PART_PX],
+            averaged,
+            None if raw is None else raw[y : y + _PART_PX, x : x + _PART_PX],
+        )
+        for y, x in chosen
+    ]
+    return ImageStatistics(
+        float(np.median([part.noise_variance for part in found])),
+        float(np.median([part.signal_variance for part in found])),
+        float(np.median([part.sigma_px for part in found])),
+    )
 
 
 def measure_image(

@@ -17,8 +17,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
+from semcal_ros.core.registration.periodicity import find_periods
 from semcal_ros.core.registration.tiles import PyramidLevel
 
 __all__ = ["Reference", "Region", "RegistrationSettings"]
@@ -79,6 +82,8 @@ class Reference:
         Why nothing can be registered against it, or an empty string.
     settings
         Limits of acceptance.
+    is_sparse
+        Whether most of it has no structure.
     """
 
     region: Region
@@ -87,3 +92,9 @@ class Reference:
     noise_variance: float
     defect: str
     settings: RegistrationSettings = field(default_factory=RegistrationSettings)
+    is_sparse: bool = False
+
+    @cached_property
+    def periods(self) -> Array:
+        """(k, 2) periods of what repeats, px; looked for when first asked."""
+        return find_periods(self.coarse.pyramid.centred(1), self.noise_variance)

@@ -19,9 +19,11 @@ full resolution (:mod:`.inverse_compositional`). A wrong shift is worse than non
 therefore accepted only if the two stages agree, the halves of the overlap agree, the images have
 most of their structure in common, and no competing shift explains the image as well.
 
-It fails, and says so, on images without structure in some direction, on periodic specimens
-without a prediction that is good to half a period, and on images whose scales differ by more than
-about 1 %.
+Where not all of the image moves by one shift, the specimen is what moves as predicted, or nearly all of the structure
+(:mod:`.agreement`); the rest is left out. A periodic specimen is registered by its defects (:mod:`.periodicity`).
+
+It fails, and says so, on images without structure in some direction, on periodic specimens without defects, where two
+parts move differently and nothing says which is the specimen, and on images whose scales differ by more than about 1 %.
 """
 
 from __future__ import annotations
@@ -34,12 +36,21 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.acceptance import find_failure
+from semcal_ros.core.registration.agreement import (
+    Agreement,
+    MovingTiles,
+    TileNoise,
+    find_agreement,
+    information_weights,
+)
 from semcal_ros.core.registration.ambiguity import choose_peak
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
     SimilarityFit,
+    TileStatistics,
     align,
+    align_reweighted,
     unmeasured_alignment,
 )
 from semcal_ros.core.registration.mismatch import explain_deformation, explain_mismatch
@@ -47,11 +58,14 @@ from semcal_ros.core.registration.noise_spectrum import (
     estimate_noise_variance,
     gaussian_taps,
     measure_image,
+    measure_richest_parts,
 )
 from semcal_ros.core.registration.normalised_correlation import (
+    CoarsePeak,
     CoarseReference,
     find_coarse_peaks,
 )
+from semcal_ros.core.registration.periodicity import choose_period
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.tiles import Pyramid, make_level
 
@@ -78,10 +92,26 @@ _MIN_LEVEL_PX = 160
 _SATURATION_SAMPLES = 256
 # Variance of the structure over that of the noise; chance makes less of images of 96 px and more.
 _MIN_SIGNAL = 0.06
+# The same of the richest of some 150 parts: by chance they have 0.15.
+_MIN_SIGNAL_OF_PARTS = 0.3
 # The variance of the structure is at least this part of the whole, however large the noise is
 # estimated: the correlation stays finite.
 _MIN_SIGNAL_SHARE = 0.02
 
+
+# Of a shift that is the specimen's by itself, and at least, with a prediction.
+_MOST_AGREES, _LEAST_SHARE = 0.85, 0.1
+_HALF = 0.5
+# Less than this of the structure agrees where images are of two motions, though no part was found to be one.
+_MUCH_AGREES = 0.85
+# 1-sigma of a prediction that leaves no place for two motions, px.
+_WELL_PREDICTED_PX = 1.0
+# Peaks that are tried, and 1-sigma up to which a prediction is a start of its own, px.
+_HYPOTHESES, _PREDICTED_PX = 3, 4.0
+# Shifts that are one, px, and the chi-square up to which one is that of the prediction (1 in 10^4).
+_SAME_SHIFT_PX, _NEAR_CHI2 = 0.5, 18.4
+# Places along each axis at which the noise is measured.
+_PATCHES = 3
 
 # How an image appears that fits part by part, but not by one shift. (That its halves disagree says it already.)
 _SIGNS_OF_DEFORMATION = frozenset(
@@ -112,12 +142,18 @@ class Registration:
     nearest_px
         (2,) the shift nearest to the prediction among those between which a rejected registration
         could not decide; NaN otherwise.
+    moving
+        What does not move with the specimen and was left out; None where all does.
+    share
+        Part of the structure that agrees with the shift.
     """
 
     alignment: Alignment
     correlation: float
     rejection: Rejection[MatchFailure] | None
     nearest_px: Array = field(default_factory=lambda: np.full(2, np.nan))
+    moving: MovingTiles | None = None
+    share: float = 1.0
 
     _middle_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
     _origin_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
@@ -244,8 +280,13 @@ def prepare_reference(
     if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
         # A sparse specimen need not show anything there; the whole image decides.
         statistics = measure_image(gray, averaged, before)
-    if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
-        return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
+    is_sparse = statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance
+    if is_sparse:
+        # A few particles are a small part of the variance, and tell a shift as well as many.
+        found = measure_richest_parts(gray, averaged, before)
+        if found.signal_variance < _MIN_SIGNAL_OF_PARTS * found.noise_variance:
+            return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
+        statistics = replace(found, noise_variance=statistics.noise_variance)
     levels = []
     for factor in _reduction_factors(gray.shape):
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
@@ -253,7 +294,9 @@ def prepare_reference(
             levels.append(level)
     if not levels:
         defect = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
-    return Reference(inside, coarse, tuple(levels), statistics.noise_variance, defect, limits)
+    return Reference(
+        inside, coarse, tuple(levels), statistics.noise_variance, defect, limits, is_sparse
+    )
 
 
 def _texture(gray: AnyImage, inside: Region, limits: RegistrationSettings) -> AnyImage:
@@ -319,6 +362,7 @@ def register(
     guess_covariance: ArrayLike | None = None,
     image_region: Region | None = None,
     max_shear_px: float = 0.0,
+    apart: bool = False,
 ) -> Registration:
     """Measure the shift of ``image`` against a prepared reference.
 
@@ -336,6 +380,9 @@ def register(
     max_shear_px
         Largest shear that may be due to drift during the scan. Up to it the upper and the lower
         half of the image may disagree in proportion.
+    apart
+        Whether something in the image is expected to move apart from the specimen, as in the image before. It is
+        found without, which takes twice as long.
 
     Returns
     -------
@@ -356,6 +403,8 @@ def register(
     origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)
     guess = np.asarray(guess_px, dtype=np.float64) - origin
     pyramid = Pyramid(gray)
+    moving: MovingTiles | None = None
+    of_parts = reference.is_sparse or apart
     peaks = find_coarse_peaks(reference.coarse, pyramid, guess)
     if not peaks:
         found = explain_mismatch(reference.coarse, pyramid, guess)
@@ -363,30 +412,62 @@ def register(
             MatchFailure.NO_PEAK, found or "no shift stands out: featureless, or another place"
         )
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
-    chosen = choose_peak(reference, pyramid, peaks, guess, spread)
-    if isinstance(chosen, Rejection):
+    least = reference.settings.min_competing_height * peaks[0].correlation
+    repeats = len(peaks) > 1 and peaks[1].correlation >= least and len(reference.periods) > 0
+    chosen: tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]
+    if repeats:
+        finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True) or peaks
+        told = choose_period(
+            reference.levels,
+            pyramid,
+            reference.periods,
+            np.array(finest[0].shift_px),
+            guess,
+            spread,
+        )
+        chosen = told if isinstance(told, Rejection) else (_peak_at(finest[0], told), told)
+    elif of_parts:
+        chosen = peaks[0], None
+    else:
+        chosen = choose_peak(reference, pyramid, peaks, guess, spread)
+    alignment: Alignment | Rejection[MatchFailure]
+    peak, refined = (peaks[0], chosen) if isinstance(chosen, Rejection) else chosen
+    if refined is not None:
+        alignment = refined
+    elif of_parts:
+        # The rest would add noise, or pull.
+        alignment = Rejection(MatchFailure.UNDETERMINED, "too little of the specimen in common")
+    else:
+        alignment = align(reference.levels, pyramid, np.array(peak.shift_px))
+        if isinstance(alignment, Rejection) or not alignment.converged:
+            # A coarse search is only good to a fraction of its pixels, and fine textures forgive less.
+            peak, alignment = _align_at_finest(reference, pyramid, guess, peak, alignment)
+    texture = _texture(gray, inside, reference.settings)
+    image_noise = estimate_noise_variance(texture)
+    # A tile with a defect is no tile that moves.
+    whole = None if repeats or of_parts else _look_at_whole(reference, alignment, image_noise)
+    kept = None
+    if not repeats and (whole is None or not whole.is_complete):
+        kept = _keep_specimen(reference, pyramid, alignment, peak, peaks, guess, spread)
+    if kept is None and isinstance(chosen, Rejection):
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(distances))].shift_px) + origin
         return Registration(unmeasured_alignment(), float("nan"), chosen, nearest)
-    peak, refined = chosen
-    alignment = (
-        align(reference.levels, pyramid, np.array(peak.shift_px)) if refined is None else refined
-    )
-    if isinstance(alignment, Rejection) or not alignment.converged:
-        # A coarse search is only good to a fraction of its pixels, and fine textures forgive less.
-        finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True)
-        if finest and np.max(np.abs(np.subtract(finest[0].shift_px, peak.shift_px))) < peak.step_px:
-            peak = finest[0]
-            levels = [level for level in reference.levels if level.factor <= peak.step_px]
-            alignment = align(levels, pyramid, np.array(peak.shift_px))
+    share = 1.0 if whole is None else whole.share
+    if kept is not None:
+        alignment, peak, moving, share = kept
+    if moving is not None:
+        moving = replace(moving, corner_px=moving.corner_px + np.array(inside[:2]))
     if isinstance(alignment, Rejection):
         named = _name_deformation(alignment, reference, pyramid)
         return Registration(unmeasured_alignment(), float("nan"), named)
-    texture = _texture(gray, inside, reference.settings)
-    correlation = _correct_correlation(reference, texture, alignment)
+    correlation = _correct_correlation(reference, image_noise, alignment)
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     if rejection is not None:
         rejection = _name_deformation(rejection, reference, pyramid)
+    elif kept is None and whole is not None and whole.share < _MUCH_AGREES:
+        reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
+        rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
     moved = replace(
         alignment,
         shift_px=alignment.shift_px + origin,
@@ -395,8 +476,176 @@ def register(
     height, width = np.shape(image)[:2]
     middle = 0.5 * (np.array([width, height]) - np.add(inside[:2], inside[2:]))
     return Registration(
-        moved, correlation, rejection, _middle_px=middle.astype(np.float64), _origin_px=origin
+        moved,
+        correlation,
+        rejection,
+        moving=moving,
+        share=share,
+        _middle_px=middle.astype(np.float64),
+        _origin_px=origin,
     )
+
+
+def _align_at_finest(
+    reference: Reference,
+    pyramid: Pyramid,
+    guess: Array,
+    peak: CoarsePeak,
+    before: Alignment | Rejection[MatchFailure],
+) -> tuple[CoarsePeak, Alignment | Rejection[MatchFailure]]:
+    """Search again at the finest resolution near a peak, and align there; what was found before if there is none."""
+    finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True)
+    if not finest or np.max(np.abs(np.subtract(finest[0].shift_px, peak.shift_px))) >= peak.step_px:
+        return peak, before
+    levels = [level for level in reference.levels if level.factor <= finest[0].step_px]
+    return finest[0], align(levels, pyramid, np.array(finest[0].shift_px))
+
+
+def _peak_at(peak: CoarsePeak, alignment: Alignment) -> CoarsePeak:
+    x, y = alignment.shift_px.tolist()
+    return replace(peak, shift_px=(x, y))
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A shift of those tiles that agree with it."""
+
+    alignment: Alignment
+    agreement: Agreement
+    start: CoarsePeak
+
+
+def _look_at_whole(
+    reference: Reference, alignment: Alignment | Rejection[MatchFailure], image_noise: float
+) -> Agreement | None:
+    """Which tiles agree with an alignment of the whole image; None where it did not converge."""
+    if isinstance(alignment, Rejection) or not alignment.converged:
+        return None
+    statistics = alignment.tile_statistics()
+    assert statistics is not None
+    sigma_px = reference.levels[-1].sigma_px
+    return find_agreement(statistics, TileNoise.of(sigma_px, reference.noise_variance, image_noise))
+
+
+def _keep_specimen(
+    reference: Reference,
+    pyramid: Pyramid,
+    alignment: Alignment | Rejection[MatchFailure],
+    peak: CoarsePeak,
+    peaks: list[CoarsePeak],
+    guess: Array,
+    spread: Array | None,
+) -> tuple[Alignment | Rejection[MatchFailure], CoarsePeak, MovingTiles | None, float] | None:
+    """The alignment of the specimen alone where not all of the image moves with it; None where all does."""
+    level = reference.levels[-1]
+    noise = TileNoise.of(
+        level.sigma_px, reference.noise_variance, _estimate_least_noise(pyramid.full)
+    )
+    first = information_weights(
+        level.normal_matrices[..., :2, :2],
+        float(level.normal_matrices[0, 0, 3, 3]),
+        level.sigma_px,
+        noise,
+    )
+    starts = [peak, *(p for p in peaks[:_HYPOTHESES] if p is not peak)]
+    sigma = np.inf if spread is None else float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
+    if sigma < _PREDICTED_PX:
+        x, y = guess.tolist()
+        starts.insert(0, replace(peak, shift_px=(x, y), step_px=1.0 + 3.0 * sigma))
+    if isinstance(alignment, Alignment) and alignment.converged:
+        x, y = alignment.shift_px.tolist()
+        starts.insert(0, replace(peak, shift_px=(x, y), step_px=peak.step_px))
+    found: list[_Hypothesis] = []
+    for start in starts:
+        if any(
+            np.max(np.abs(np.subtract(start.shift_px, h.alignment.shift_px))) < _SAME_SHIFT_PX
+            for h in found
+        ):
+            continue
+        tried = align_reweighted(
+            level,
+            pyramid,
+            np.array(start.shift_px),
+            first,
+            noise.reference,
+            lambda tiles: find_agreement(tiles, noise).weights,
+        )
+        if isinstance(tried, Rejection) or not tried.converged:
+            continue
+        statistics = tried.tile_statistics()
+        assert statistics is not None
+        agreement = find_agreement(statistics, noise)
+        is_one = agreement.share >= _LEAST_SHARE and agreement.are_bodies
+        if is_one and not any(
+            np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < _SAME_SHIFT_PX for h in found
+        ):
+            found.append(_Hypothesis(tried, agreement, start))
+            is_near = spread is not None and _is_near(tried, guess, spread)
+            if is_near and sigma < _WELL_PREDICTED_PX and agreement.share > _HALF:
+                # No other one can have as much.
+                break
+    if not found:
+        return None
+    best = _choose_hypothesis(found, guess, spread)
+    if isinstance(best, Rejection):
+        return best, peak, None, 0.0
+    statistics = best.alignment.tile_statistics()
+    assert statistics is not None
+    moving = _moving_tiles(reference, statistics, best)
+    shown = moving if moving.share > 0.0 else None
+    return best.alignment, best.start, shown, best.agreement.share
+
+
+def _choose_hypothesis(
+    found: list[_Hypothesis], guess: Array, spread: Array | None
+) -> _Hypothesis | Rejection[MatchFailure]:
+    """The shift that is the specimen's: by the prediction, or because nearly all agrees with it."""
+    ordered = sorted(found, key=lambda h: -h.agreement.share)
+    if spread is not None:
+        near = [h for h in ordered if _is_near(h.alignment, guess, spread)]
+        sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
+        if len(near) == 1 and sigma < _PREDICTED_PX:
+            return near[0]
+    best = ordered[0]
+    others = sum(h.agreement.share for h in ordered[1:])
+    if best.agreement.share > _MOST_AGREES and others < 0.5 * best.agreement.share:
+        return best
+    return Rejection(
+        MatchFailure.AMBIGUOUS,
+        f"ambiguous: {100.0 * best.agreement.share:.0f} % of the structure moves by one shift, and "
+        "nothing says that this is the specimen",
+    )
+
+
+def _is_near(alignment: Alignment, guess: Array, spread: Array) -> bool:
+    innovation = alignment.shift_px - guess
+    covariance = spread + alignment.covariance + np.eye(2) * _SAME_SHIFT_PX**2
+    return float(innovation @ np.linalg.solve(covariance, innovation)) <= _NEAR_CHI2
+
+
+def _moving_tiles(
+    reference: Reference, statistics: TileStatistics, found: _Hypothesis
+) -> MovingTiles:
+    level = reference.levels[-1]
+    side = np.array(level.side, dtype=np.float64)
+    first = np.array([statistics.cols.start, statistics.rows.start])
+    corner = np.array(level.origin) + first * side + found.alignment.shift_px
+    return MovingTiles.of(found.agreement.disagrees, corner, side)
+
+
+def _estimate_least_noise(image: AnyImage) -> float:
+    """Variance of the noise where it is small: a bright tool has more of it."""
+    height, width = image.shape
+    patches = [
+        image[
+            row * height // _PATCHES : (row + 1) * height // _PATCHES,
+            col * width // _PATCHES : (col + 1) * width // _PATCHES,
+        ]
+        for row in range(_PATCHES)
+        for col in range(_PATCHES)
+    ]
+    variances = sorted(estimate_noise_variance(patch) for patch in patches)
+    return variances[_PATCHES]
 
 
 def _name_deformation(
@@ -413,11 +662,11 @@ def _reject(failure: MatchFailure, reason: str) -> Registration:
     return Registration(unmeasured_alignment(), float("nan"), Rejection(failure, reason))
 
 
-def _correct_correlation(reference: Reference, gray: AnyImage, alignment: Alignment) -> float:
-    """Correlation that the noise-free images would have."""
+def _correct_correlation(reference: Reference, variance: float, alignment: Alignment) -> float:
+    """Correlation that the noise-free images would have; ``variance`` is that of the image's noise."""
     passed = float(np.sum(gaussian_taps(reference.levels[-1].sigma_px) ** 2)) ** 2
     noise = reference.noise_variance * passed
-    image_noise = estimate_noise_variance(gray) * passed
+    image_noise = variance * passed
     whole, image_whole = alignment.reference_variance, alignment.image_variance
     signal = max(whole - noise, _MIN_SIGNAL_SHARE * whole)
     image_signal = max(image_whole - image_noise, _MIN_SIGNAL_SHARE * image_whole)

@@ -126,14 +126,28 @@ class TileFit:
     step: Array
 
 
-def prepare_geometry(level: PyramidLevel, window: TileWindow) -> TileGeometry:
-    """Geometry of a window; that of the latest one is kept, because drift is slow."""
+def prepare_geometry(
+    level: PyramidLevel, window: TileWindow, weights: Array | None = None, noise: float = 0.0
+) -> TileGeometry:
+    """Geometry of a window; that of the latest one without weights is kept, because drift is slow.
+
+    With ``weights`` (rows, cols) of the tiles, the variance ``noise`` per pixel of the smoothed reference does not
+    lower the gain: what a gain that is too small leaves of a structure that is cut by the edge of the tiles that count,
+    would pull the shift.
+    """
+    if weights is not None:
+        return _compute_geometry(level, window, weights, noise)
     return level.geometries.get_or_compute(window.key, lambda: _compute_geometry(level, window))
 
 
-def _compute_geometry(level: PyramidLevel, window: TileWindow) -> TileGeometry:
+def _compute_geometry(
+    level: PyramidLevel, window: TileWindow, weights: Array | None = None, noise: float = 0.0
+) -> TileGeometry:
     shape = len(window.y), len(window.x)
     normal_matrices = level.normal_matrices[window.rows, window.cols].reshape(-1, 4, 4)
+    if weights is not None:
+        normal_matrices = normal_matrices * weights.reshape(-1, 1, 1)
+        normal_matrices[:, 2, 2] -= noise * normal_matrices[:, 3, 3]
     ramps, pairs = _make_ramps(shape)
     whole = (normal_matrices.reshape(-1, 16).T @ pairs).reshape(4, 4, 3, 3).transpose(0, 2, 1, 3)
     energy = np.diag(whole[:2, 0, :2, 0])

@@ -159,6 +159,10 @@ class TileSums:
     energy: Array
     hessian: Array
 
+    def weighted(self, weights: Array, hessian: Array) -> TileSums:
+        """The sums with weights (rows, cols) of the tiles, and the Hessian that belongs to them."""
+        return TileSums(self.cross * weights[..., None], self.energy * weights, hessian)
+
 
 @dataclass(frozen=True)
 class _Curvature:
@@ -311,11 +315,14 @@ def tile_sums(
     shift: Array,
     hessian: Array | None,
     enough: int = HESSIAN_PIXELS,
+    weights: Array | None = None,
 ) -> TileSums:
     """Sums over the window's tiles of ``image`` sampled at the reference's pixels plus ``shift``.
 
     ``image`` is at the resolution of the level, about its mean (:meth:`Pyramid.centred`). ``hessian`` is
-    that of an earlier shift of the same images, None to compute it from ``enough`` pixels.
+    that of an earlier shift of the same images, None to compute it from ``enough`` pixels; with ``weights``
+    (rows, cols) of the window's tiles it is that of these tiles, from all of their pixels, and the sums are
+    still those without.
     """
     rows, cols = window.rows, window.cols
     whole = np.rint(shift).astype(int)
@@ -327,7 +334,9 @@ def tile_sums(
     fraction = np.asarray(shift - whole, dtype=np.float64)
     band, smoothing = _band(level.sigma_px), gaussian_taps(level.sigma_px)
     sampled = sample_tiles(image, corner, count, level.side, fraction, smoothing, band)
-    if hessian is None:
+    if hessian is None and weights is not None:
+        hessian = np.einsum("rc,rcij->ij", weights, _tile_hessians(level, window, sampled))
+    elif hessian is None:
         hessian = _common_hessian(level, window, sampled, enough)
     tiles = sampled.transpose(1, 0, 2)
     cross = np.empty((count[1], count[0], 4))
@@ -354,6 +363,19 @@ def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image, eno
     whole = np.array([normal_matrices[..., 0, 0].sum(), normal_matrices[..., 1, 1].sum()])
     share = np.sqrt(whole / np.maximum(curvature.energy[own].sum(axis=0), 1e-30))
     return np.array([[xx, xy], [xy, yy]]) * np.outer(share, share)
+
+
+def _tile_hessians(level: PyramidLevel, window: TileWindow, sampled: Image) -> Array:
+    """(rows, cols, 2, 2) products of both images' gradients in each tile."""
+    rows, cols = window.rows, window.cols
+    everything = np.arange(len(window.y))
+    curvature = level._curvatures.get_or_compute(
+        (rows.start, rows.stop, ALL_PIXELS, (cols.start, cols.stop)),
+        lambda: _compute_curvature(level, rows, cols, everything, 0),
+    )
+    weights = curvature.weights.reshape(3, len(window.x), len(window.y), -1)
+    xx, xy, yy = np.einsum("pcrn,crn->prc", weights, sampled).astype(np.float64)
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(*xx.shape, 2, 2)
 
 
 def _pick_rows(level: PyramidLevel, window: TileWindow, enough: int) -> tuple[Indices, int]:

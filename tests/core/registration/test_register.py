@@ -167,15 +167,43 @@ def test_prepared_reference_gives_the_same() -> None:
 
 
 @pytest.mark.parametrize("period", [8.0, 12.0, 30.0])
-def test_lattice_is_refused_without_and_resolved_with_a_prediction(period: float) -> None:
+def test_a_perfect_lattice_is_refused_whatever_the_prediction(period: float) -> None:
+    """Nothing in the image would tell a jump by a period."""
     shift = (2.3, -1.2)
     pair = [noisy(lattice(SIZE, period, s), 4.0, k) for k, s in enumerate([(0.0, 0.0), shift])]
     _refused(register_pair(*pair), "ambiguous")
-    vague = np.eye(2) * (2.0 * period) ** 2
-    _refused(register_pair(*pair, guess_px=shift, guess_covariance=vague), "ambiguous")
-    result = register_pair(*pair, guess_px=(2.0, -1.0), guess_covariance=np.eye(2) * 0.5)
-    assert result.accepted, result.reason
-    np.testing.assert_allclose(result.shift_px, shift, atol=0.05)
+    for sigma in (2.0 * period, 0.7):
+        covariance = np.eye(2) * sigma**2
+        result = register_pair(*pair, guess_px=(2.0, -1.0), guess_covariance=covariance)
+        _refused(result, "ambiguous")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_defects_of_a_lattice_tell_its_shift_also_after_a_jump(seed: int) -> None:
+    """Random periods, defects and shifts; some of the predictions are wrong by a period or two."""
+    rng = np.random.default_rng(seed)
+    period, angle = rng.uniform(8.0, 20.0), rng.uniform(0.0, 0.7)
+    shift = rng.uniform(-6.0, 6.0, 2)
+    defects = rng.uniform(0.25 * SIZE, 0.75 * SIZE, (4, 2))
+
+    def picture(at: np.ndarray, seed: int) -> np.ndarray:
+        whole = lattice(SIZE, period, (float(at[0]), float(at[1])), angle)
+        y, x = np.mgrid[:SIZE, :SIZE]
+        for defect in defects + at:
+            whole = whole + 2.0 * np.exp(-((x - defect[0]) ** 2 + (y - defect[1]) ** 2) / 18.0)
+        return noisy(whole, 4.0, seed)
+
+    pair = picture(np.zeros(2), 2 * seed), picture(shift, 2 * seed + 1)
+    along = 2.0 * period * np.array([np.cos(angle), np.sin(angle)])
+    for guess in (shift + 0.3, shift + along):
+        result = register_pair(*pair, guess_px=guess, guess_covariance=np.eye(2) * 0.5)
+        # Never by a period, whatever was predicted.
+        if result.accepted:
+            np.testing.assert_allclose(result.shift_px, shift, atol=0.06)
+        else:
+            assert "ambiguous" in result.reason
+    near = register_pair(*pair, guess_px=shift + 0.3, guess_covariance=np.eye(2) * 0.5)
+    assert near.accepted, near.reason
 
 
 def test_prediction_does_not_override_an_unambiguous_picture() -> None:

@@ -1,0 +1,329 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which tiles of an image agree with a shift: what moves otherwise, or came in, is found and left out.
+
+A tool over a specimen covers its structure and brings edges of its own. A tile agrees where the image shows as much of
+the reference's structure as the gain says, little else, and no shift of its own. What a tile counts follows from its
+gradients over their noise: ground without structure neither helps nor disagrees.
+
+It fails where what moves has no structure and covers none, and where its structure looks like that of the specimen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.registration.fractional_delay import FINE, SHARP, gradients
+from semcal_ros.core.registration.inverse_compositional import TileStatistics
+from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smooth
+
+__all__ = ["Agreement", "MovingTiles", "TileNoise", "find_agreement", "information_weights"]
+
+# What of the structure of a tile may be missing, or be there besides, as a part of it: contrast changes with charging,
+# focus and contamination by some tenths over a field.
+_MISSING, _BESIDES = 0.4, 0.6
+# Standard deviations of the noise by which it must exceed that: once in 10^5 tiles that agree.
+_SIGMAS = 4.5
+# A shift of a tile of its own, px: distortion and interpolation leave some hundredths.
+_OWN_SHIFT_PX = 0.15
+# Part of the tiles that fit best.
+_BEST_TILES = 0.3
+# Standard deviations from which a tile is looked at together with its neighbours.
+_SUSPECT = 3.5
+# Tiles that tell a gain, the least that a median of them can be, and the range about it.
+_LEAST_TELLING, _LEAST_GAIN, _GAIN_RANGE = 12, 0.3, 1.5
+# Part of the structure that agrees with a shift where all of the image moves by it.
+_ALL_AGREES = 0.97
+# Tiles of a body that moves, at least.
+_LEAST_TILES = 2
+# By how much the shift may change from the middle of the rows to their ends, px, as halves of an image may disagree.
+_LARGEST_STRETCH_PX = 0.3
+# Part of the tiles that disagree, from which on most of them must be in bodies, and how many tiles make one.
+_FEW_DISAGREE, _BODY_TILES = 0.05, 4
+# A tile whose own shift is less certain than this says nothing by it.
+_TELLING_PX = 0.5
+
+
+@dataclass(frozen=True)
+class TileNoise:
+    """Noise of a reference and of an image after smoothing, per pixel.
+
+    Attributes
+    ----------
+    reference, image
+        Variances in squared grey levels.
+    gradient
+        What a variance of one before smoothing gives in squares of a gradient along one axis.
+    passed
+        What smoothing leaves of a variance.
+    """
+
+    reference: float
+    image: float
+    gradient: float
+    passed: float
+
+    @classmethod
+    def of(cls, sigma_px: float, reference: float, image: float) -> TileNoise:
+        """From variances of white noise before smoothing by ``sigma_px``."""
+        passed, gradient = _pass_noise(sigma_px)
+        return cls(reference * passed, image * passed, gradient, passed)
+
+
+@lru_cache(maxsize=16)
+def _pass_noise(sigma_px: float) -> tuple[float, float]:
+    """What smoothing leaves of the variance of white noise, and the square of a gradient along one axis."""
+    impulse = np.zeros((65, 65), dtype=np.float32)
+    impulse[32, 32] = 1.0
+    # As of a smooth image, or a sharp one: the level chooses the same way.
+    slope = gradients(smooth(impulse, sigma_px), SHARP if sigma_px < 0.3 else FINE)[0]
+    return float(np.sum(gaussian_taps(sigma_px) ** 2)) ** 2, float(np.sum(slope**2))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Tiles that agree with a shift.
+
+    Attributes
+    ----------
+    weights
+        (rows, cols) of the tiles that were compared: their information over the noise, and 0 where they disagree.
+    disagrees
+        (rows, cols) the tiles that show something else.
+    share
+        Part of the compared tiles with structure that agrees.
+    pull
+        Part of all gradients that does not, and would pull the shift.
+    """
+
+    weights: Array
+    disagrees: Mask
+    share: float
+    pull: float
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all of the image agrees: no body does not, not even where the ground has no structure."""
+        most = self.share > _ALL_AGREES and self.pull < 1.0 - _ALL_AGREES
+        return most and not np.any(_keep_bodies(self.disagrees, _BODY_TILES))
+
+    @property
+    def are_bodies(self) -> bool:
+        """Whether the tiles that disagree lie together; scattered ones say that the images differ everywhere."""
+        tiles = int(np.count_nonzero(self.disagrees))
+        if tiles <= _FEW_DISAGREE * self.disagrees.size:
+            return True
+        _, _, statistics, _ = cv2.connectedComponentsWithStats(
+            self.disagrees.astype(np.uint8), connectivity=4
+        )
+        areas = statistics[1:, cv2.CC_STAT_AREA]
+        return bool(areas[areas >= _BODY_TILES].sum() > 0.6 * tiles)
+
+
+def information_weights(gradient: Array, pixels: float, sigma_px: float, noise: TileNoise) -> Array:
+    """(rows, cols) 0 to 1: what of the gradients of tiles (rows, cols, 2, 2) is structure and not noise.
+
+    A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
+    """
+    energy = np.trace(gradient, axis1=-2, axis2=-1)
+    expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
+    # Smoothed noise has fewer independent pixels.
+    scatter = expected * np.sqrt((1.0 + 4.0 * np.pi * sigma_px**2) / pixels)
+    signal = np.where(energy - expected > _SIGMAS * scatter, energy - expected, 0.0)
+    own = signal / np.maximum(signal + expected, 1e-30)
+    return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
+
+
+def find_agreement(tiles: TileStatistics, noise: TileNoise) -> Agreement:
+    """Which tiles agree with the shift at which they were compared."""
+    shared = 1.0 + 4.0 * np.pi * tiles.sigma_px**2
+    count, weights = (
+        tiles.pixels,
+        information_weights(tiles.gradient, tiles.pixels, tiles.sigma_px, noise),
+    )
+    gain = _bound_gain(tiles, noise, weights)
+    raw = tiles.image - 2.0 * gain * tiles.common + gain**2 * tiles.reference
+    # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.
+    least = float(np.quantile(raw, _BEST_TILES)) / count
+    floor = gain**2 * noise.reference + noise.image
+    hidden = max(1.0, least / max(float(np.median(floor)), 1e-30))
+    floor = hidden * floor
+    structure = gain**2 * np.maximum(tiles.reference - count * hidden * noise.reference, 0.0)
+    # Scatter of sums of products of smoothed noise.
+    scatter = np.sqrt(shared * (count * floor**2 + 2.0 * structure * floor))
+    missing = structure - gain * tiles.common
+    lacks = missing > _MISSING * structure + _SIGMAS * scatter
+    left = raw - count * floor
+    # Where it is bright, electrons scatter more than where the noise was measured: twice as much is nothing.
+    exceeds = left > _BESIDES * structure + count * floor + _SIGMAS * np.sqrt(2.0) * scatter
+    disagrees = lacks | exceeds
+    louder = replace(noise, reference=hidden * noise.reference, image=hidden * noise.image)
+    disagrees = disagrees | _moves(tiles, weights, louder, shared, ~disagrees)
+    # By area: a bright tool has more of a gradient than all of the ground.
+    share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
+    # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
+    body = _fill(_keep_bodies(disagrees, _BODY_TILES))
+    left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    energy = weights * np.trace(tiles.gradient, axis1=-2, axis2=-1)
+    pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
+    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull)
+
+
+def _keep_bodies(disagrees: Mask, least: int) -> Mask:
+    """The tiles that lie together in bodies of at least so many; one alone is chance, or a particle that blinks."""
+    found = disagrees.astype(np.uint8)
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
+    large = np.flatnonzero(statistics[:, cv2.CC_STAT_AREA] >= least)
+    return np.asarray(disagrees & np.isin(labels, large))
+
+
+def _bound_gain(tiles: TileStatistics, noise: TileNoise, weights: Array) -> Array:
+    """The gain, within a factor of that of the median tile: what came in must not say how bright the specimen is."""
+    known = tiles.reference - tiles.pixels * noise.reference
+    telling = (weights > 0.0) & (known > tiles.pixels * noise.reference)
+    gain = np.maximum(tiles.gain, 0.0)
+    ratios = tiles.common[telling] / known[telling]
+    # What came in has nothing in common with what it covers.
+    ratios = ratios[ratios > _LEAST_GAIN]
+    if len(ratios) < _LEAST_TELLING:
+        return gain
+    middle = float(np.median(ratios))
+    return np.clip(gain, middle / _GAIN_RANGE, middle * _GAIN_RANGE)
+
+
+def _fill(disagrees: Mask) -> Mask:
+    """Tiles without holes: none between tiles that disagree, and none that they enclose."""
+    # A body may come in over the edge: what it encloses with the edge is inside, too.
+    rows, cols = disagrees.shape
+    joined = cv2.morphologyEx(
+        np.pad(disagrees.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)
+    )
+    contours, _ = cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    drawn = cv2.drawContours(np.zeros_like(joined), contours, -1, 1, cv2.FILLED)
+    return np.asarray(drawn[2 : 2 + rows, 2 : 2 + cols] > 0)
+
+
+def _moves(
+    tiles: TileStatistics, weights: Array, noise: TileNoise, shared: float, counts: Mask
+) -> Mask:
+    """The tiles with a shift of their own, beyond one that changes in proportion over the field."""
+    gain = np.maximum(tiles.gain, 1e-6)
+    # Structure along both axes, by what of the gradient is none of the noise.
+    energy = weights[..., None] * np.einsum("rcii->rci", tiles.gradient) * gain[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = -tiles.scores / energy
+        variance = (
+            shared
+            * (gain**2 * noise.reference + noise.image)[..., None]
+            / (energy * gain[..., None])
+        )
+    telling = (variance < _TELLING_PX**2) & counts[..., None]
+    rows, cols = weights.shape
+    if not np.any(np.abs(own[telling]) > _OWN_SHIFT_PX + _SUSPECT * np.sqrt(variance[telling])):
+        # Nearly always: no tile is off at all.
+        return np.zeros((rows, cols), dtype=bool)
+    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij")
+    found = np.zeros((rows, cols), dtype=bool)
+    for axis in (0, 1):
+        known = telling[..., axis]
+        if np.count_nonzero(known) < 12:
+            continue
+        design = np.stack([np.ones_like(x), x, y], axis=-1)[known]
+        value, sigma = own[..., axis][known], np.sqrt(variance[..., axis][known])
+        # What the ground leaves of a line; a bright edge is surer of itself than all the ground.
+        spread = np.hypot(sigma, _OWN_SHIFT_PX)
+        terms = np.array([np.median(value), 0.0, 0.0])
+        for _ in range(3):
+            left = np.abs(value - design @ terms)
+            good = left <= 3.0 * max(float(np.median(left)), _OWN_SHIFT_PX)
+            scaled = design[good] / spread[good, None]
+            terms, *_ = np.linalg.lstsq(scaled, value[good] / spread[good], rcond=None)
+        value = _without_rows(value - design @ terms, known)
+        left = np.abs(value)
+        scatter = max(1.0, 1.4826 * float(np.median(left / sigma)))
+        uncertain = scatter * np.sqrt(float(np.linalg.pinv(scaled.T @ scaled)[1, 1]))
+        if abs(float(terms[1])) > _LARGEST_STRETCH_PX + _SIGMAS * uncertain:
+            # What changes along a row is no drift: the specimen is strained or turned, and no part of it is a tool.
+            return np.ones_like(found)
+        found[known] |= left > _OWN_SHIFT_PX + _SIGMAS * sigma
+        # What is too little in one tile its neighbours tell, if they move alike.
+        precision, signed = np.zeros((rows, cols)), np.zeros((rows, cols))
+        precision[known], signed[known] = sigma**-2.0, value
+        total = cv2.blur(precision, (3, 3), borderType=cv2.BORDER_CONSTANT)
+        mean = cv2.blur(precision * signed, (3, 3), borderType=cv2.BORDER_CONSTANT)
+        mean = mean / np.maximum(total, 1e-30)
+        together = 1.0 / np.sqrt(np.maximum(9.0 * total, 1e-30))
+        alike = np.sign(signed) == np.sign(mean)
+        found |= known & alike & (np.abs(mean) > _OWN_SHIFT_PX + _SIGMAS * together)
+    return found
+
+
+def _without_rows(values: Array, known: Mask) -> Array:
+    """Shifts of the known tiles without what the tiles of a row share: lines of a scan jitter as a whole."""
+    grid = np.full(known.shape, np.nan)
+    grid[known] = values
+    enough = np.count_nonzero(known, axis=1) >= _LEAST_TELLING // 2
+    grid[enough] -= np.nanmedian(grid[enough], axis=1, keepdims=True)
+    return np.asarray(grid[known])
+
+
+@dataclass(frozen=True)
+class MovingTiles:
+    """Where an image shows something that moves otherwise than the specimen.
+
+    Attributes
+    ----------
+    tiles
+        (rows, cols) True where it does.
+    corner_px, side_px
+        (2,) left and top of the first tile in the image, and width and height of a tile, px.
+    share
+        Part of the compared field.
+    """
+
+    tiles: Mask
+    corner_px: Array
+    side_px: Array
+    share: float
+
+    @classmethod
+    def of(cls, disagrees: Mask, corner_px: Array, side_px: Array) -> MovingTiles:
+        """From the tiles that disagree: a body has no holes, and is more than one tile."""
+        filled = _fill(_keep_bodies(disagrees, _LEAST_TILES))
+        return cls(filled, corner_px, side_px, float(filled.mean()))
+
+    def draw(
+        self, size: tuple[int, int], *, moved_px: Array | None = None, scale: float = 1.0
+    ) -> NDArray[np.uint8]:
+        """(height, width) image of (width, height): 255 where something moves.
+
+        The tiles are moved by ``moved_px`` (2,) before the image is made larger by ``scale``.
+        """
+        width, height = size
+        corner = self.corner_px if moved_px is None else self.corner_px + moved_px
+        x, y = (
+            np.floor(((np.arange(n) + 0.5) / scale - 0.5 - first) / side).astype(int)
+            for n, first, side in zip((width, height), corner, self.side_px, strict=True)
+        )
+        rows, cols = self.tiles.shape
+        inside = np.outer((y >= 0) & (y < rows), (x >= 0) & (x < cols))
+        shown = self.tiles[np.clip(y, 0, rows - 1)[:, None], np.clip(x, 0, cols - 1)] & inside
+        return np.where(shown, np.uint8(255), np.uint8(0))

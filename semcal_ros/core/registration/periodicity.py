@@ -1,0 +1,239 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Shift of a periodic specimen: its period leaves a class of shifts, among which only defects can tell.
+
+All shifts that differ by a period show a perfect lattice alike, so that a prediction would only hide a jump by a
+period. Defects decide: at a wrong shift, every defect disagrees twice, where it is and where it should be. What no
+defect tells is refused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+
+from semcal_ros.core.arrays import Array, Image, mad_sigma
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.inverse_compositional import (
+    Alignment,
+    align,
+    tile_residual_energies,
+)
+from semcal_ros.core.registration.normalised_correlation import remove_shading
+from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
+
+__all__ = ["choose_period", "find_periods"]
+
+# Side of the part of an image in which periods are looked for.
+_CROP_PX = 512
+# Least period: what repeats faster is beyond the Nyquist limit of a scan that is sampled well.
+_LEAST_PERIOD_PX = 4.0
+# Part of the structure that repeats.
+_REPEATED = 0.6
+# How deep the autocorrelation falls on the way to a period, as a part of what repeats.
+_DIP = 0.7
+# Sine of the least angle between two periods.
+_LEAST_ANGLE = 0.3
+# Shifts that are compared at most. Those that the prediction allows and that correlate best come first.
+_MOST_COMPARED = 16
+# How far the prediction reaches, in standard deviations.
+_REACH = 4.0
+# A defect is a tile that one shift explains so many robust deviations better than another one: by chance, 1 in 10^6
+# tiles. The squares of the deviations must sum to the evidence: two such tiles.
+_DEFECT_SIGMAS, _EVIDENCE = 5.0, 60.0
+# Half a pixel tells one shift from another.
+_SAME_SHIFT_PX = 0.5
+
+
+def find_periods(image: Image, noise_variance: float) -> Array:
+    """(k, 2) periods (x, y) of an image, px, the shortest first; k is 0 where nothing repeats, 1 for lines.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey levels.
+    noise_variance
+        Variance of its white noise.
+    """
+    rows, cols = (min(n, _CROP_PX) for n in image.shape)
+    top, left = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
+    part = remove_shading(np.asarray(image[top : top + rows, left : left + cols]))
+    part = part - part.mean()
+    size = (
+        scipy.fft.next_fast_len(2 * rows, real=True),
+        scipy.fft.next_fast_len(2 * cols, real=True),
+    )
+    spectrum = scipy.fft.rfft2(part, size)
+    whole = scipy.fft.irfft2(np.abs(spectrum) ** 2, size)
+    high, wide = rows // 2, cols // 2
+    # Lags of one half plane; the other one is its mirror image.
+    lags = np.concatenate([whole[: high + 1, -wide:], whole[: high + 1, : wide + 1]], axis=1)
+    y, x = np.arange(high + 1)[:, None], np.arange(-wide, wide + 1)[None, :]
+    surface = lags / ((rows - y) * (cols - np.abs(x)))
+    structure = float(surface[0, wide]) - noise_variance
+    if structure <= 0.0:
+        return np.zeros((0, 2))
+    surface = surface / structure
+    peaks = _find_repeats(surface, wide)
+    if not peaks:
+        return np.zeros((0, 2))
+    first = peaks[0]
+    for second in peaks[1:]:
+        across = abs(first[0] * second[1] - first[1] * second[0])
+        if across > _LEAST_ANGLE * np.hypot(*first) * np.hypot(*second):
+            return np.array([first, second])
+    return np.array([first])
+
+
+def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
+    """Lags at which the structure repeats, the shortest first."""
+    inner = surface[1:-1, 1:-1]
+    is_peak = inner >= _REPEATED
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            if dy or dx:
+                rows, cols = surface.shape
+                is_peak &= inner >= surface[1 + dy : rows - 1 + dy, 1 + dx : cols - 1 + dx]
+    found = []
+    for row, col in zip(*np.nonzero(is_peak), strict=True):
+        y, x = float(row + 1), float(col + 1 - wide)
+        length = np.hypot(x, y)
+        if length < _LEAST_PERIOD_PX:
+            continue
+        steps = np.linspace(0.0, 1.0, int(2 * length) + 1)[1:-1]
+        way = surface[np.rint(steps * y).astype(int), np.rint(steps * x).astype(int) + wide]
+        if float(way.min()) > _DIP * surface[row + 1, col + 1]:
+            continue
+        found.append(
+            (
+                length,
+                x + _vertex(surface[row + 1, col : col + 3]),
+                y + _vertex(surface[row : row + 3, col + 1]),
+            )
+        )
+    # Lags along the first row have their mirror image in it.
+    mirrored = surface[0]
+    for col in range(wide + int(_LEAST_PERIOD_PX), len(mirrored) - 1):
+        x = float(col - wide)
+        if mirrored[col] < _REPEATED or mirrored[col] < max(mirrored[col - 1], mirrored[col + 1]):
+            continue
+        if mirrored[col] < max(surface[1, col - 1 : col + 2]):
+            continue
+        if float(mirrored[wide + 1 : col].min()) <= _DIP * mirrored[col]:
+            found.append((x, x + _vertex(mirrored[col - 1 : col + 2]), 0.0))
+    return [(x, y) for _, x, y in sorted(found)]
+
+
+def _vertex(values: Array) -> float:
+    before, middle, after = values.tolist()
+    curvature = before - 2.0 * middle + after
+    return (
+        0.0 if curvature >= 0.0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+    )
+
+
+def choose_period(
+    levels: tuple[PyramidLevel, ...],
+    pyramid: Pyramid,
+    periods: Array,
+    start_px: Array,
+    guess: Array,
+    spread: Array | None,
+) -> Alignment | Rejection[MatchFailure]:
+    """The shift of a periodic specimen that its defects tell, or why it is not told.
+
+    Parameters
+    ----------
+    levels, pyramid
+        Reference and image.
+    periods
+        As found by :func:`find_periods`.
+    start_px
+        (2,) any shift that explains the image.
+    guess, spread
+        (2,) predicted shift and its covariance (2, 2), or None.
+    """
+    fine = levels[-1:]
+    first = align(fine, pyramid, start_px)
+    if isinstance(first, Rejection):
+        return first
+    shifts = _list_shifts(first.shift_px, periods, guess, spread, fine[0].size)
+    compared: list[tuple[Alignment, Array]] = []
+    for shift in shifts:
+        found = align(fine, pyramid, shift)
+        if isinstance(found, Rejection) or not found.converged:
+            continue
+        if any(np.max(np.abs(found.shift_px - a.shift_px)) < _SAME_SHIFT_PX for a, _ in compared):
+            continue
+        energies = tile_residual_energies(fine[0], pyramid, found.shift_px)
+        if energies is not None:
+            compared.append((found, energies))
+    if not compared:
+        return Rejection(MatchFailure.NOT_CONVERGED, "refinement did not converge at any period")
+    best = compared[0]
+    for other in compared[1:]:
+        if _weigh(best[1], other[1]) < 0.0:
+            best = other
+    x, y = best[0].shift_px.tolist()
+    for other in compared:
+        if other is not best and _weigh(best[1], other[1]) < _EVIDENCE:
+            a, b = other[0].shift_px.tolist()
+            return Rejection(
+                MatchFailure.AMBIGUOUS,
+                f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, whose defects do not tell "
+                f"shifts ({x:.1f}, {y:.1f}) and ({a:.1f}, {b:.1f}) px apart",
+            )
+    if len(compared) == 1:
+        return Rejection(
+            MatchFailure.AMBIGUOUS,
+            f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, and only one shift to compare",
+        )
+    return best[0]
+
+
+def _list_shifts(
+    shift: Array, periods: Array, guess: Array, spread: Array | None, size: tuple[int, int]
+) -> Array:
+    """Shifts of the class that the prediction allows, and those next to it; the nearest to it first."""
+    counts = np.arange(-60, 61)
+    if len(periods) == 1:
+        steps = counts[:, None] * periods[0]
+    else:
+        steps = (counts[:, None, None] * periods[0] + counts[None, :, None] * periods[1]).reshape(
+            -1, 2
+        )
+    found = shift + steps
+    found = found[np.all(np.abs(found) < 0.5 * np.array(size), axis=1)]
+    covariance = np.eye(2) * (0.25 * max(size)) ** 2 if spread is None else spread
+    covariance = covariance + np.eye(2) * (0.5 * np.hypot(*periods[0])) ** 2
+    left = found - guess
+    distances = np.einsum("ni,ij,nj->n", left, np.linalg.inv(covariance), left)
+    order = np.argsort(distances, kind="stable")
+    # The nearest ones always compete: a jump by a period is what must not happen.
+    allowed = (distances[order] <= _REACH**2) | (np.arange(len(order)) < 9)
+    return found[order[allowed]][:_MOST_COMPARED]
+
+
+def _weigh(first: Array, second: Array) -> float:
+    """Evidence for the first of two shifts against the second, by the residual energies of their tiles."""
+    difference = (second - first).ravel()
+    difference = difference[np.isfinite(difference)]
+    if len(difference) == 0:
+        return 0.0
+    middle = float(np.median(difference))
+    deviations = (difference - middle) / max(mad_sigma(difference - middle), 1e-30)
+    clear = deviations[np.abs(deviations) > _DEFECT_SIGMAS]
+    return float(np.sum(np.sign(clear) * clear**2))

@@ -1,0 +1,122 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What moves apart from the specimen is found, left out and said; where nothing says which is which, it is refused."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from semcal_ros.core.registration.agreement import MovingTiles
+from semcal_ros.core.registration.register import Registration, prepare_reference, register
+from tests.helpers.drift_scenes import Texture, noisy
+
+SIZE = 256
+GROUND, TOOL = Texture(3), Texture(9)
+
+
+def with_tool(
+    shift: tuple[float, float], reach: float, seed: int, level: float = 210.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """A texture at a shift with a bright wedge from the left, and where the wedge is."""
+    picture = GROUND.view(shift, SIZE)
+    mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    corners = np.array([[-10, 20], [reach * 0.6, 20], [reach, 120], [reach * 0.6, 235], [-10, 235]])
+    cv2.fillPoly(mask, [np.rint(corners * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
+    part = mask / 255.0
+    whole = 110.0 + 35.0 * picture / picture.std()
+    # The tool has a texture of its own, and takes it along.
+    own = TOOL.view((reach, 0.0), SIZE)
+    drawn = whole * (1.0 - part) + (level + 15.0 * own / own.std()) * part
+    rng = np.random.default_rng(seed)
+    return np.clip(drawn + rng.normal(0.0, 6.0, drawn.shape), 0, 255).astype(np.uint8), part > 0.5
+
+
+def registered(
+    before: float, after: float, shift: tuple[float, float], sigma_px: float | None = 0.5
+) -> tuple[Registration, np.ndarray]:
+    reference = prepare_reference(with_tool((0.0, 0.0), before, 0)[0])
+    image, covered = with_tool(shift, after, 1)
+    covariance = None if sigma_px is None else np.eye(2) * sigma_px**2
+    guess = np.array(shift) + [0.2, -0.2]
+    return register(reference, image, guess_px=guess, guess_covariance=covariance), covered
+
+
+@pytest.mark.parametrize("reach", [60.0, 90.0, 130.0])
+def test_a_tool_does_not_pull_the_specimen_along(reach: float) -> None:
+    shift = (2.3, -1.4)
+    found, covered = registered(reach - 12.0, reach, shift)
+    assert found.accepted, found.reason
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(found.shift_px - shift) < np.maximum(4.0 * sigma, 0.01))
+    assert np.max(sigma) < 0.05
+    assert found.moving is not None
+    shown = found.moving.draw((SIZE, SIZE)) > 0
+    # Tiles of 8 to 10 px: the edge is known to one of them.
+    inner = cv2.erode(covered.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+    outer = cv2.dilate(covered.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+    # What its texture has in common with the ground by chance is not seen to move.
+    assert shown[inner].mean() > 0.5
+    assert shown[~outer].mean() < 0.02
+    assert found.moving.share == pytest.approx(covered.mean(), abs=0.1)
+
+
+def test_where_all_moves_alike_nothing_is_left_out() -> None:
+    for seed in range(5):
+        pair = [
+            noisy(GROUND.view(s, SIZE), 4.0, 2 * seed + k) for k, s in enumerate([(0, 0), (3.2, 1)])
+        ]
+        found = register(prepare_reference(pair[0]), pair[1])
+        assert found.accepted
+        assert found.moving is None
+
+
+def test_half_and_half_without_a_prediction_is_refused() -> None:
+    reference = noisy(GROUND.view((0.0, 0.0), SIZE), 4.0, 0)
+    other = Texture(8)
+    image = noisy(GROUND.view((6.0, 0.0), SIZE), 4.0, 1)
+    reference[:, : SIZE // 2] = noisy(other.view((0.0, 0.0), SIZE), 4.0, 2)[:, : SIZE // 2]
+    image[:, : SIZE // 2] = noisy(other.view((-6.0, 2.0), SIZE), 4.0, 3)[:, : SIZE // 2]
+    assert not register(prepare_reference(reference), image).accepted
+    # A prediction says which of the two is the specimen.
+    for shift in ((6.0, 0.0), (-6.0, 2.0)):
+        found = register(
+            prepare_reference(reference),
+            image,
+            guess_px=shift,
+            guess_covariance=np.eye(2) * 0.2**2,
+        )
+        assert found.accepted, found.reason
+        np.testing.assert_allclose(found.shift_px, shift, atol=0.05)
+
+
+def test_the_mask_lies_where_the_tiles_are() -> None:
+    tiles = np.zeros((4, 5), dtype=bool)
+    tiles[1:3, 2:4] = True
+    moving = MovingTiles.of(tiles, np.array([3.0, 5.0]), np.array([10.0, 8.0]))
+    drawn = moving.draw((64, 48))
+    assert drawn.shape == (48, 64)
+    rows, cols = np.nonzero(drawn)
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (13, 28, 23, 42)
+    shifted = moving.draw((128, 96), moved_px=np.array([-3.0, -5.0]), scale=2.0)
+    rows, cols = np.nonzero(shifted)
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (17, 48, 41, 80)
+
+
+def test_one_tile_alone_is_no_body() -> None:
+    tiles = np.zeros((6, 6), dtype=bool)
+    tiles[2, 3] = True
+    assert MovingTiles.of(tiles, np.zeros(2), np.ones(2)).share == 0.0

@@ -1,0 +1,67 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Periods of an image. That defects decide, and nothing else, is tested in test_register.py."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.registration.periodicity import find_periods
+from tests.helpers.drift_scenes import Texture
+
+SIZE = 256
+
+
+def waves(first: tuple[float, float], second: tuple[float, float], seed: int) -> Array:
+    """A lattice with these periods, px, and noise of variance 1."""
+    reciprocal = np.linalg.inv(np.array([first, second])).T
+    y, x = np.mgrid[:SIZE, :SIZE]
+    phases = [2.0 * np.pi * (k[0] * x + k[1] * y) for k in reciprocal]
+    lattice = 2.0 * (np.cos(phases[0]) + np.cos(phases[1]))
+    return np.asarray(lattice + np.random.default_rng(seed).normal(size=(SIZE, SIZE)))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [((8.3, 1.2), (-1.1, 9.4)), ((12.0, 0.0), (0.0, 17.0)), ((20.0, 6.0), (-5.0, 23.0))],
+)
+def test_the_periods_of_a_lattice(first: tuple[float, float], second: tuple[float, float]) -> None:
+    found = find_periods(np.asarray(waves(first, second, 0), dtype=np.float32), 1.0)
+    assert found.shape == (2, 2)
+    # Any two periods that span the same lattice, to a tenth of a pixel.
+    counts = found @ np.linalg.inv(np.array([first, second]))
+    np.testing.assert_allclose(counts, np.rint(counts), atol=0.02)
+    assert abs(np.linalg.det(np.rint(counts))) == pytest.approx(1.0)
+
+
+def test_lines_have_one_period() -> None:
+    y, x = np.mgrid[:SIZE, :SIZE]
+    lines = 3.0 * np.cos(2.0 * np.pi * (x + 0.3 * y) / 14.0)
+    noise = np.random.default_rng(1).normal(size=(SIZE, SIZE))
+    found = find_periods(np.asarray(lines + noise, dtype=np.float32), 1.0)
+    assert len(found) >= 1
+    across = np.array([1.0, 0.3])
+    # The step across the lines is one period of 14 px along x, or none along them.
+    counts = found @ across / 14.0
+    np.testing.assert_allclose(counts, np.rint(counts), atol=0.05)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_texture_does_not_repeat(seed: int) -> None:
+    texture = 40.0 * Texture(seed).view((0.0, 0.0), SIZE)
+    noise = np.random.default_rng(seed).normal(size=texture.shape)
+    assert len(find_periods(np.asarray(texture + noise, dtype=np.float32), 1.0)) == 0
