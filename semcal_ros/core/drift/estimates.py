@@ -31,6 +31,7 @@ from semcal_ros.core.drift.similarity import SimilarityPredictor, turn_drift
 from semcal_ros.core.drift.state import MOTION_SIZE, DriftState
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.core.wording import omit_numbers
@@ -202,6 +203,9 @@ class DriftUpdate(DriftEstimate):
     doubt
         (2, 2) the part of the covariance that is due to images that contradict the prediction, this one or
         those before; zero where the drift rests on the frame's own image.
+    moving
+        What does not move with the specimen, in px of the rectified frame before its drift is removed; None where
+        nothing was found.
     """
 
     status: DriftStatus
@@ -216,6 +220,7 @@ class DriftUpdate(DriftEstimate):
     keyframe_time_s: float
     merged: bool
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
+    moving: MovingTiles | None = field(default=None, kw_only=True)
 
     @property
     def accepted(self) -> bool:

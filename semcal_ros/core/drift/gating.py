@@ -38,6 +38,8 @@ __all__ = [
 #: Innovations beyond this normalised square occur in a correct filter once in a million frames
 #: (chi-square with 2 degrees of freedom).
 GATE = 27.6
+# Part of the structure that must show a jump for it to be one of the stage.
+_WHOLE = 0.95
 # Multiple of the first step's sigma within which a shift agrees with what was expected: 95 %.
 _REACH_SIGMAS = 2.0
 # Divisions by intervals stay finite; no stream has frames that are nearer to each other.
@@ -124,6 +126,7 @@ def judge_shift(
     nis: float,
     frame: ScanFrame,
     *,
+    share: float = 1.0,
     is_first: bool,
     last_s: float,
     first_step_px: float,
@@ -143,6 +146,9 @@ def judge_shift(
         Its innovation's normalised square.
     frame
         The frame that was measured.
+    share
+        Part of its structure that shows the shift. What a part of the image does that was not expected, a tool does
+        as well as a stage.
     is_first
         Whether nothing was measured before: the first step has only a guessed prior, which must not
         refuse what was registered well.
@@ -165,6 +171,10 @@ def judge_shift(
     if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
         reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
         return Rejection(MatchFailure.STAGE_MOVE, reason)
+    is_far = max(x_px, y_px) > _REACH_SIGMAS * first_step_px
+    if share < _WHOLE and is_far and (is_first or is_outlier):
+        reason = f"shift of {100.0 * share:.0f} % of the structure is {np.sqrt(nis):.0f} deviations from the prediction"
+        return Rejection(MatchFailure.OUTLIER, reason)
     if is_first or not is_outlier:
         return None
     position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]

@@ -88,6 +88,11 @@ class KeyframeStore:
     def __getitem__(self, key: int) -> Keyframe:
         return self._keyframes[key]
 
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """Numbers of the keyframes."""
+        return tuple(self._keyframes)
+
     def __len__(self) -> int:
         return len(self._keyframes)
 

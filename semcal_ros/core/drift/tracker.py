@@ -29,7 +29,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array
+from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import (
@@ -67,6 +67,7 @@ from semcal_ros.core.drift.measurement import (
     measure_itself,
 )
 from semcal_ros.core.drift.operations import CorrectShear, Marginalise, Measure, Predict
+from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
 from semcal_ros.core.drift.similarity import (
     SimilarityMatch,
     SimilarityTracker,
@@ -85,8 +86,8 @@ __all__ = ["DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
 
 # The velocity is expected to change by this part of the first step per frame, to begin with.
 _VELOCITY_CHANGE = 0.1
-# A disputed position counts as three standard deviations away.
-_DISPUTED_SIGMAS = 3.0
+# A disputed position counts as two standard deviations away.
+_DISPUTED_SIGMAS = 2.0
 # Changes of scale up to which the keyframe stays in use, resampled for each frame.
 _SMALL_ZOOM = 1.15
 # A frame whose correlation with its keyframe is lower takes its place: the specimen changes.
@@ -111,6 +112,8 @@ _MAX_SHEAR = 0.1
 _MAX_TURN_PX = 0.1
 # Divisions by intervals stay finite.
 _MIN_INTERVAL_S = 1e-9
+# Frames in which an overlay is looked for: the first ones, and then every so many.
+_FIRST_LOOKS, _LOOK_EVERY = 3, 8
 # What an image looks like that shows another place: the prediction need not hold.
 _ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
 
@@ -121,7 +124,9 @@ class _Track:
 
     ``camera`` and ``time_s`` are those of the latest frame, ``sample`` is some of its pixels, and
     ``rejected`` is the number of frames in a row that did not match. ``doubt`` (2, 2) is what the last
-    frames that contradict the prediction add to the covariance of the drift, until one matches.
+    frames that contradict the prediction add to the covariance of the drift, until one matches. ``apart`` says whether
+    something in the last frame that matched did not move with the specimen. ``before`` is the last frame as it came,
+    and ``overlay`` what is drawn into all of them, of which there were ``seen``.
     """
 
     filter: DriftFilter
@@ -132,6 +137,10 @@ class _Track:
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    apart: bool = False
+    before: AnyImage | None = None
+    overlay: Mask | None = None
+    seen: int = 0
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
     similarity: SimilarityTracker = field(
         default_factory=lambda: SimilarityTracker(keeps_history=False)
@@ -282,14 +291,42 @@ class DriftTracker:
             track, update = self._begin(frame, centre_s)
             self._track = track
         else:
+            frame = self._without_overlay(track, frame)
             self._predict(track, frame, centre_s)
             update = self._follow(track, frame)
+        if track.seen < _FIRST_LOOKS or (track.seen + 1) % _LOOK_EVERY == 0:
+            track.before = pixels.copy()
         track.filter.mark_frame()
         track.similarity.mark_frame(track.filter.state.time_s)
         track.camera, track.time_s = fitted, centre_s
         if self._history is not None:
             self._history.add(update, fitted)
         return update
+
+    def _without_overlay(self, track: _Track, frame: ScanFrame) -> ScanFrame:
+        """The frame without what is drawn into it; the first time, the keyframes are freed of it, too."""
+        track.seen += 1
+        looks = track.seen <= _FIRST_LOOKS or track.seen % _LOOK_EVERY == 0
+        if looks and track.before is not None and not np.array_equal(track.before, frame.image):
+            found = find_overlay(track.before, frame.image)
+            is_new = found is not None and track.overlay is None
+            track.overlay = found
+            if is_new:
+                for key in track.store.keys:
+                    self._clean_keyframe(track, key)
+        overlay = track.overlay
+        if overlay is None or overlay.shape != frame.image.shape[:2]:
+            return frame
+        return replace(frame, image=remove_overlay(frame.image, overlay))
+
+    def _clean_keyframe(self, track: _Track, key: int) -> None:
+        old, overlay = track.store[key], track.overlay
+        if overlay is None or overlay.shape != old.frame.image.shape[:2]:
+            return
+        frame = replace(old.frame, image=remove_overlay(old.frame.image, overlay))
+        image, region = self._corrector.corrected_image(frame, old.removed, old.turn)
+        keyframe = make_keyframe(frame, old.removed, image, region, old.time_s, old.turn)
+        track.store.replace(key, keyframe)
 
     # -- the first frame --------------------------------------------------------------------------
 
@@ -490,6 +527,7 @@ class DriftTracker:
             guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
             image_region=region,
             max_shear_px=_MAX_SHEAR * frame.size[1],
+            apart=track.apart,
         )
         if registration.rejection is not None:
             return _RejectedMatch(registration.rejection, registration)
@@ -549,6 +587,7 @@ class DriftTracker:
             measure,
             outcome.nis,
             frame,
+            share=match.registration.share,
             is_first=drift_filter.measured == 0,
             last_s=track.time_s,
             first_step_px=self.settings.first_step_px,
@@ -608,6 +647,7 @@ class DriftTracker:
         track.doubt = np.zeros((2, 2))
         track.outliers.reset(state)
         registration, candidate = match.registration, match.candidate
+        track.apart = registration.moving is not None
         if candidate.ratio > _SMALL_ZOOM:
             return _make_update(track, frame, DriftStatus.KEYFRAME, registration=registration)
         store.use(candidate.key)
@@ -804,4 +844,5 @@ def _make_update(
         similarity=similarity.mean,
         similarity_covariance=similarity.covariance,
         doubt=track.doubt,
+        moving=None if registration is None else registration.moving,
     )

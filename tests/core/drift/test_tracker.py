@@ -250,12 +250,17 @@ def test_a_sudden_onset_of_drift_is_followed(pace: float) -> None:
     np.testing.assert_allclose(updates[-1].velocity_m_s, [pace, 0.0], atol=0.1)
 
 
-def test_lattice_is_followed_without_hops() -> None:
+def test_a_lattice_with_defects_is_followed_without_hops() -> None:
     tracker = DriftTracker()
     worst = 0.0
+    y, x = np.mgrid[:192, :192]
     for k in range(14):
         shift = (1.3 * k, -0.7 * k)
-        update = tracker.update(noisy(lattice(160, 14.0, shift), 4.0, k), float(k))
+        picture = lattice(192, 14.0, shift)
+        for column, row in ((70.0, 110.0), (120.0, 60.0), (105.0, 135.0)):
+            square = (x - column - shift[0]) ** 2 + (y - row - shift[1]) ** 2
+            picture = picture + 2.0 * np.exp(-square / 18.0)
+        update = tracker.update(noisy(picture, 4.0, k), float(k))
         assert update.accepted, update.reason
         worst = max(worst, float(np.max(np.abs(update.drift_px - shift))))
     # 18 px of travel on a lattice that repeats after 20 px.
