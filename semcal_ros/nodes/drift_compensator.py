@@ -30,7 +30,7 @@ __all__ = ["DriftCompensator", "main"]
 
 
 class DriftCompensator(StreamNode):
-    """Publishes ``image_stabilized``, ``drift`` and ``drift_velocity``.
+    """Publishes ``image_stabilized``, ``drift``, ``drift_velocity`` and ``~/moving``.
 
     The scale in metres comes from the configured display width; the distortion stays in the images.
     """

@@ -28,7 +28,7 @@ __all__ = ["StreamCorrector", "main"]
 
 
 class StreamCorrector(CalibratedStreamNode):
-    """Publishes ``image_rect``, ``camera_info``, ``projection_stamped``, ``drift`` and ``drift_velocity``.
+    """Publishes ``image_rect``, ``camera_info``, ``projection_stamped``, ``drift``, ``drift_velocity``, ``~/moving``.
 
     Without a calibration the drift is still removed, on the scale of the display width.
     """

@@ -288,24 +288,31 @@ def test_stream_corrector_corrects_every_frame(replay: Replay, tmp_path: Path) -
     infos = peer.collect(CameraInfo, "camera_info")
     drifts = peer.collect(PoseWithCovarianceStamped, "drift")
     velocities = peer.collect(TwistWithCovarianceStamped, "drift_velocity", RELIABLE)
+    masks = peer.collect(Image, "stream_corrector/moving", RELIABLE)
     settings = {
         "config": "virtual_sem",
         "qos_overrides./other/image_raw.subscription.depth": 50,
     }
     with running("stream_corrector", settings, *remap) as corrector:
         peer.wait_for(lambda: "calibration from topic" in corrector.output, "the calibration")
-        outputs = ("image_rect", "camera_info", "drift", "drift_velocity")
+        outputs = ("image_rect", "camera_info", "drift", "drift_velocity", "~/moving")
         peer.wait_heard("/other/stream_corrector", *outputs)
         player = {"bag": tmp_path / "bag", "start_paused": True, "wait_for_subscribers": 1}
         with running("bag_player", player, *topics, *remap[:2]):
             peer.call(SetBool, "/other/bag_player/pause", SetBool.Request(data=False))
-            results = (images, infos, drifts, velocities)
+            results = (images, infos, drifts, velocities, masks)
             peer.wait_for(lambda: min(map(len, results)) >= 4, "4 frames")
         answer = peer.trigger("stream_corrector/reset")
         assert answer.success
     peer.close()
     assert [stamp_of(m) for m in images] == [stamp_of(m) for m in infos]
     assert [stamp_of(m) for m in images] == [stamp_of(m) for m in drifts]
+    assert [stamp_of(m) for m in images] == [stamp_of(m) for m in masks]
+    assert (masks[0].width, masks[0].height, masks[0].encoding) == (
+        images[0].width,
+        images[0].height,
+        "mono8",
+    )
     assert infos[0].k[0] == pytest.approx(CALIBRATION.at(1500.0).rectified.K[0, 0])
     # A new keyframe is where drift is zero by definition, exactly.
     first = drifts[0].pose.pose.position

@@ -52,14 +52,14 @@ EXECUTABLES = {
     "stream_corrector": ExecutableHelp(
         "Removes drift and distortion from the live stream in one interpolation.",
         "image_raw, magnification, calibration, conditions",
-        "image_rect, camera_info, projection_stamped, projection_covariance_stamped, drift, drift_velocity",
+        "image_rect, camera_info, projection_stamped, projection_covariance_stamped, drift, drift_velocity, ~/moving",
         "~/reset",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
     "drift_compensator": ExecutableHelp(
         "Removes drift from the live stream; needs no calibration.",
         "image_raw, magnification",
-        "image_stabilized, drift, drift_velocity",
+        "image_stabilized, drift, drift_velocity, ~/moving",
         "~/reset",
         "-p config:=jsm820",
     ),

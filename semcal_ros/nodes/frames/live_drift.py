@@ -94,10 +94,13 @@ class FrameDrift:
         The drift at the centre of the frame.
     measured
         The latest frame whose drift was measured: this frame or an earlier one.
+    binned
+        Pixels of the frame per pixel of what was measured.
     """
 
     estimate: DriftEstimate
     measured: DriftUpdate
+    binned: int = 1
 
     @property
     def is_forecast(self) -> bool:
@@ -108,6 +111,15 @@ class FrameDrift:
     def raster(self) -> RasterDrift:
         """Return the drift during the frame, for a rectifier."""
         return self.estimate.raster
+
+    def draw_moving(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """Return an image (height, width), 255 where the corrected frame shows what does not move with the specimen."""
+        moving = self.measured.moving
+        if moving is None:
+            width, height = size
+            return np.zeros((height, width), dtype=np.uint8)
+        drift_px = self.measured.px_from_unit @ self.measured.drift_m
+        return moving.draw(size, moved_px=-drift_px, scale=float(self.binned))
 
 
 class LiveDrift:
@@ -157,6 +169,7 @@ class LiveDrift:
             DriftSettings(rekey_overlap=values["keyframe_overlap"], max_jump=values["max_jump"])
         )
         self._is_beside = False
+        self._binned = 1
         self._origin_ns: int | None = None
         self._latest: Measurement | None = None
         self._at_work: Future[Measurement] | None = None
@@ -187,12 +200,14 @@ class LiveDrift:
             small = self._bin(frame, camera)
             self._at_work = self._beside.measure(tracker, *small, time_s, scan)
         assert self._latest is not None
-        return _estimate_at(self._latest, centre_s)
+        return _estimate_at(self._latest, centre_s, self._binned)
 
     def _bin(
         self, frame: StreamFrame, camera: ScanCamera
     ) -> tuple[NDArray[np.generic], ScanCamera]:
-        return bin_image(frame.image, camera, self._parameters[_DETAIL.name])
+        small, fitted = bin_image(frame.image, camera, self._parameters[_DETAIL.name])
+        self._binned = frame.image.shape[1] // small.shape[1]
+        return small, fitted
 
     def _beside_is_free(self) -> bool:
         rested = self._at_work is None and time.monotonic() >= self._rest_until_s
@@ -256,8 +271,8 @@ class LiveDrift:
         self._reporter.note("drift_ms", 1e3 * self._load.cost_s)
 
 
-def _estimate_at(latest: Measurement, centre_s: float) -> FrameDrift:
+def _estimate_at(latest: Measurement, centre_s: float, binned: int) -> FrameDrift:
     update = latest.update
     if centre_s == update.time_s:
-        return FrameDrift(update, update)
-    return FrameDrift(latest.predictor.at(centre_s), update)
+        return FrameDrift(update, update, binned)
+    return FrameDrift(latest.predictor.at(centre_s), update, binned)

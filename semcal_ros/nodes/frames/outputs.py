@@ -32,7 +32,7 @@ from semcal_ros.bridge.drift import (
     rotation_rate_of,
 )
 from semcal_ros.bridge.headers import copy_header
-from semcal_ros.bridge.images import pixel_memory
+from semcal_ros.bridge.images import fill_image, pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -194,13 +194,15 @@ class RectifiedOutput:
 
 
 class DriftOutput:
-    """Publishes ``drift`` and ``drift_velocity``, and notes the state of the tracking."""
+    """Publishes ``drift``, ``drift_velocity`` and ``~/moving``, and notes the state of the tracking."""
 
     def __init__(self, endpoints: Endpoints, reporter: Reporter) -> None:
         self._reporter = reporter
         self._drift = endpoints.stream_publisher(PoseWithCovarianceStamped, "drift")
         self._velocity = endpoints.stream_publisher(TwistWithCovarianceStamped, "drift_velocity")
+        self._moving = endpoints.stream_publisher(Image, "~/moving")
         self._messages = PoseWithCovarianceStamped(), TwistWithCovarianceStamped()
+        self._mask = Image()
         self._coasting = 0
         self._forecast = 0
         self.trouble = ""
@@ -227,6 +229,9 @@ class DriftOutput:
                 rotation_rate_of(drift.estimate),
             )
             self._velocity.publish(twist)
+        if self._moving.is_awaited:
+            fill_image(self._mask, drift.draw_moving(frame.size), "mono8", frame.header)
+            self._moving.publish(self._mask)
         measured = drift.measured
         self._coasting += not (measured.accepted or drift.is_forecast)
         self._forecast += drift.is_forecast
@@ -235,6 +240,7 @@ class DriftOutput:
             ("drift_status", measured.status_text),
             ("drift_residual", float(measured.residual)),
             ("drift_overlap", float(measured.overlap)),
+            ("drift_moving_share", 0.0 if measured.moving is None else measured.moving.share),
             ("drift_frames_coasted", self._coasting),
             ("drift_frames_forecast", self._forecast),
         )
