@@ -37,6 +37,8 @@ DRIFT_COLUMNS = (
     "sigma_y_m",
     "dx_px",
     "dy_px",
+    "sigma_x_px",
+    "sigma_y_px",
     "status",
 )
 """Columns of ``drift.csv``."""

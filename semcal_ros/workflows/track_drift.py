@@ -110,7 +110,14 @@ class DriftTrack:
         drift = self.path
         sigma_m = drift.sigma_m
         rows: list[tuple[object, ...]] = [
-            (stamp_ns, *drift.drift_m[k], *sigma_m[k], *drift.drift_px[k], drift[k].status_text)
+            (
+                stamp_ns,
+                *drift.drift_m[k],
+                *sigma_m[k],
+                *drift.drift_px[k],
+                *drift[k].sigma_px,
+                drift[k].status_text,
+            )
             for k, stamp_ns in enumerate(self.stamps_ns)
         ]
         columns: tuple[str, ...] = DRIFT_COLUMNS

@@ -31,7 +31,18 @@ from semcal_ros.files.tables import DRIFT_COLUMNS, write_table
 
 def test_values_read_back_exactly(tmp_path: Path) -> None:
     path = tmp_path / "drift.csv"
-    row = (1_700_000_000_123_456_789, 1 / 3, -2e-9, None, 0.1, 1.5, 2.5, "coasting: a, b")
+    row = (
+        1_700_000_000_123_456_789,
+        1 / 3,
+        -2e-9,
+        None,
+        0.1,
+        1.5,
+        2.5,
+        0.01,
+        0.02,
+        "coasting: a, b",
+    )
     write_table(path, DRIFT_COLUMNS, [row])
     with path.open(newline="") as stream:
         (read,) = csv.DictReader(stream)
@@ -49,7 +60,18 @@ def test_bad_row_keeps_the_old_table(tmp_path: Path) -> None:
     assert path.read_text() == "a\n1\n"
 
 
-_ROW = (1_700_000_000_123_456_789, 1 / 3, -2e-9, None, math.nan, 1.5, 2.5, "coasting: a, b")
+_ROW = (
+    1_700_000_000_123_456_789,
+    1 / 3,
+    -2e-9,
+    None,
+    math.nan,
+    1.5,
+    2.5,
+    0.01,
+    0.02,
+    "coasting: a, b",
+)
 
 
 def test_a_parquet_table_keeps_numbers_as_numbers(tmp_path: Path) -> None:

@@ -206,6 +206,9 @@ class DriftUpdate(DriftEstimate):
     moving
         What does not move with the specimen, in px of the rectified frame before its drift is removed; None where
         nothing was found.
+    of_scale
+        (2, 2) the part of the covariance of the drift that is due to the scale of the camera, which changes metres and
+        not pixels.
     """
 
     status: DriftStatus
@@ -221,6 +224,7 @@ class DriftUpdate(DriftEstimate):
     merged: bool
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     moving: MovingTiles | None = field(default=None, kw_only=True)
+    of_scale: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 
     @property
     def accepted(self) -> bool:
@@ -251,6 +255,15 @@ class DriftUpdate(DriftEstimate):
     def drift_px(self) -> Array:
         """(2,) drift in rectified pixels of this frame."""
         return self.px_from_unit @ self.drift_m
+
+    @property
+    def sigma_px(self) -> Array:
+        """(2,) 1-sigma of :attr:`drift_px`, without that of the scale; infinite where nothing was measured."""
+        own = self.covariance[:2, :2] - self.of_scale
+        if not np.all(np.isfinite(own)):
+            return np.full(2, np.inf)
+        variance = np.diag(self.px_from_unit @ own @ self.px_from_unit.T)
+        return np.sqrt(np.maximum(variance, 0.0))
 
 
 @dataclass(frozen=True)

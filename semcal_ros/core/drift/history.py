@@ -116,10 +116,12 @@ def _smoothed(
             turned = turn_drift(*motion, covariance, turn)
             motion = turned.position, turned.velocity, turned.acceleration
             covariance = turned.covariance
+    of_scale = scale_covariance(camera, motion[0], motion[1])
     return replace(
         update,
         drift_m=motion[0],
         velocity_m_s=motion[1],
         acceleration_m_s2=motion[2],
-        covariance=covariance + scale_covariance(camera, motion[0], motion[1]),
+        covariance=covariance + of_scale,
+        of_scale=of_scale[:2, :2],
     )

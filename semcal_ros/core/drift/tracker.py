@@ -815,7 +815,8 @@ def _make_update(
         turned = turn_drift(*motion, covariance, similarity)
         motion = turned.position, turned.velocity, turned.acceleration
         covariance = turned.covariance
-    covariance = covariance + scale_covariance(frame.camera, motion[0], motion[1])
+    of_scale = scale_covariance(frame.camera, motion[0], motion[1])
+    covariance = covariance + of_scale
     if not is_first:
         covariance[:2, :2] += track.filter.process_noise.flicker_covariance
     covariance[:2, :2] += track.doubt
@@ -845,4 +846,5 @@ def _make_update(
         similarity_covariance=similarity.covariance,
         doubt=track.doubt,
         moving=None if registration is None else registration.moving,
+        of_scale=of_scale[:2, :2],
     )

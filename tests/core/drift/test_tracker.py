@@ -250,6 +250,26 @@ def test_a_sudden_onset_of_drift_is_followed(pace: float) -> None:
     np.testing.assert_allclose(updates[-1].velocity_m_s, [pace, 0.0], atol=0.1)
 
 
+def test_the_sigma_in_px_is_that_of_the_registration_and_not_of_the_scale() -> None:
+    """A scale that is known to 3 % makes metres uncertain, and pixels not."""
+    uncertain = replace(CAMERA, covariance=np.diag([(0.03 * CAMERA.m) ** 2, *np.zeros(9)]))
+    sigmas = []
+    for camera in (CAMERA, uncertain):
+        run = Run((0.3e-6, -0.2e-6))
+        for k in range(5):
+            update = run.step(k, camera)
+        sigmas.append(update.sigma_px)
+        of_metres = np.sqrt(
+            np.diag(update.px_from_unit @ update.covariance[:2, :2] @ update.px_from_unit.T)
+        )
+        if camera is uncertain:
+            expected = np.hypot(update.sigma_px, 0.03 * np.abs(update.drift_px))
+            np.testing.assert_allclose(of_metres, expected, rtol=0.05)
+            assert np.max(of_metres) > 2.0 * np.max(update.sigma_px)
+    # A camera that is less certain also makes a measured shear less certain, which has a little to do with it.
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.05)
+
+
 def test_a_lattice_with_defects_is_followed_without_hops() -> None:
     tracker = DriftTracker()
     worst = 0.0
