@@ -121,7 +121,7 @@ def command(
         with show_progress("drawing"):
             write_drift_figure(track.path, plot, recording.name)
     echo_notes(track.notes)
-    if calibration is None:
+    if calibration is None and recording.pixel_size_m is None:
         echo_nominal_unit(
             track.config.display_width_m,
             "drift is in raw pixels, scaled by the nominal pixel size",
