@@ -172,6 +172,7 @@ def test_one_magnification_is_enough():
     assert _model_error(result, spiral, [1000.0]) < 0.03
 
 
+@pytest.mark.long
 def test_predicted_errors_are_as_large_as_the_errors():
     """Differences of projected points, which no gauge changes, against their stated sigma."""
     scores = []
