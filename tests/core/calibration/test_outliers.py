@@ -186,3 +186,13 @@ def test_where_half_of_a_magnification_disagrees_no_single_view_is_at_fault():
     # Nor where many disagree in all.
     residual[[5, 12, 20]] = 10.0
     assert not find_outliers(*_adjusted(group, residual))
+
+
+def test_a_magnification_of_which_no_view_is_left_is_not_calibrated() -> None:
+    """The only view of a magnification was recorded at one that is 6 % off."""
+    others = seen_views("jsm820", (300.0, 800.0, 1800.0, 3500.0))
+    (alone,) = _misnamed(seen_views("jsm820", (2500.0,), views=1, seed=2), 0, 1.06)
+    result = calibrate_views([*others, replace(alone, name="alone")], **OPTIONS)
+    assert [view.name for view in result.outliers] == ["alone"]
+    rows = result.model.statistics["by_magnification"]
+    assert [row["magnification"] for row in rows] == [300.0, 800.0, 1800.0, 3500.0]
