@@ -14,9 +14,10 @@
 
 """Shift of a periodic specimen: its period leaves a class of shifts, among which only defects can tell.
 
-All shifts that differ by a period show a perfect lattice alike, so that a prediction would only hide a jump by a
-period. Defects decide: at a wrong shift, every defect disagrees twice, where it is and where it should be. What no
-defect tells is refused.
+All shifts that differ by a period show a perfect lattice alike. Defects decide: at a wrong shift, every defect
+disagrees twice, where it is and where it should be. What no defect tells is refused where the lattice is fine, since a
+prediction would only hide a jump by a period. Where a period is a good part of the field, a jump by one is a move of
+the stage and no drift, and a prediction that is good to a tenth of it decides.
 """
 
 from __future__ import annotations
@@ -54,6 +55,9 @@ _REACH = 4.0
 # A defect is a tile that one shift explains so many robust deviations better than another one: by chance, 1 in 10^6
 # tiles. The squares of the deviations must sum to the evidence: two such tiles.
 _DEFECT_SIGMAS, _EVIDENCE = 5.0, 60.0
+# Part of the image's shorter side from which on a period is coarse, and of how many standard deviations of the
+# prediction half a period must consist to be predicted.
+_COARSE, _PREDICTED_SIGMAS = 1.0 / 16.0, 5.0
 # Half a pixel tells one shift from another.
 _SAME_SHIFT_PX = 0.5
 
@@ -187,6 +191,9 @@ def choose_period(
     for other in compared[1:]:
         if _weigh(best[1], other[1]) < 0.0:
             best = other
+    predicted = _find_predicted(compared, periods, guess, spread, fine[0].size)
+    if predicted is not None and (predicted is best or _weigh(best[1], predicted[1]) < _EVIDENCE):
+        return predicted[0]
     x, y = best[0].shift_px.tolist()
     for other in compared:
         if other is not best and _weigh(best[1], other[1]) < _EVIDENCE:
@@ -202,6 +209,25 @@ def choose_period(
             f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, and only one shift to compare",
         )
     return best[0]
+
+
+def _find_predicted(
+    compared: list[tuple[Alignment, Array]],
+    periods: Array,
+    guess: Array,
+    spread: Array | None,
+    size: tuple[int, int],
+) -> tuple[Alignment, Array] | None:
+    """The shift that a prediction tells; None where the lattice is fine, or the prediction not good enough."""
+    shortest = float(np.min(np.hypot(*periods.T)))
+    if spread is None or shortest < _COARSE * min(size):
+        return None
+    sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
+    if _PREDICTED_SIGMAS * sigma > 0.5 * shortest:
+        return None
+    distances = [float(np.hypot(*(a.shift_px - guess))) for a, _ in compared]
+    nearest = int(np.argmin(distances))
+    return compared[nearest] if distances[nearest] < 0.25 * shortest else None
 
 
 def _list_shifts(

@@ -22,7 +22,7 @@ most of their structure in common, and no competing shift explains the image as 
 Where not all of the image moves by one shift, the specimen is what moves as predicted, or nearly all of the structure
 (:mod:`.specimen`); the rest is left out. A periodic specimen is registered by its defects (:mod:`.periodicity`).
 
-It fails, and says so, on images without structure in some direction, on periodic specimens without defects, where two
+It fails, and says so, on images without structure in some direction, on fine lattices without defects, where two
 parts move differently and nothing says which is the specimen, and on images whose scales differ by more than about 1 %.
 """
 

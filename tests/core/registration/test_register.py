@@ -166,8 +166,20 @@ def test_prepared_reference_gives_the_same() -> None:
     np.testing.assert_array_equal(direct.shift_px, prepared.shift_px)
 
 
-@pytest.mark.parametrize("period", [8.0, 12.0, 30.0])
-def test_a_perfect_lattice_is_refused_whatever_the_prediction(period: float) -> None:
+def test_a_coarse_lattice_is_refused_without_and_resolved_with_a_prediction() -> None:
+    """A jump by a period would be a move of the stage."""
+    period, shift = 30.0, (2.3, -1.2)
+    pair = [noisy(lattice(SIZE, period, s), 4.0, k) for k, s in enumerate([(0.0, 0.0), shift])]
+    _refused(register_pair(*pair), "ambiguous")
+    vague = np.eye(2) * (2.0 * period) ** 2
+    _refused(register_pair(*pair, guess_px=shift, guess_covariance=vague), "ambiguous")
+    result = register_pair(*pair, guess_px=(2.0, -1.0), guess_covariance=np.eye(2) * 0.5)
+    assert result.accepted, result.reason
+    np.testing.assert_allclose(result.shift_px, shift, atol=0.05)
+
+
+@pytest.mark.parametrize("period", [5.0, 8.0])
+def test_a_fine_lattice_without_defects_is_refused_whatever_the_prediction(period: float) -> None:
     """Nothing in the image would tell a jump by a period."""
     shift = (2.3, -1.2)
     pair = [noisy(lattice(SIZE, period, s), 4.0, k) for k, s in enumerate([(0.0, 0.0), shift])]
