@@ -31,9 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Mask
-from semcal_ros.core.registration.fractional_delay import FINE, SHARP, gradients
+from semcal_ros.core.registration.fractional_delay import gradients
 from semcal_ros.core.registration.inverse_compositional import TileStatistics
-from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smooth
+from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
+from semcal_ros.core.registration.tiles import band_of
 
 __all__ = ["Agreement", "MovingTiles", "TileNoise", "find_agreement", "information_weights"]
 
@@ -93,9 +94,8 @@ def _pass_noise(sigma_px: float) -> tuple[float, float]:
     """What smoothing leaves of the variance of white noise, and the square of a gradient along one axis."""
     impulse = np.zeros((65, 65), dtype=np.float32)
     impulse[32, 32] = 1.0
-    # As of a smooth image, or a sharp one: the level chooses the same way.
-    slope = gradients(smooth(impulse, sigma_px), SHARP if sigma_px < 0.3 else FINE)[0]
-    return float(np.sum(gaussian_taps(sigma_px) ** 2)) ** 2, float(np.sum(slope**2))
+    slope = gradients(smooth(impulse, sigma_px), band_of(sigma_px))[0]
+    return passed_variance(sigma_px), float(np.sum(slope**2))
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def information_weights(gradient: Array, pixels: float, sigma_px: float, noise: 
     energy = np.trace(gradient, axis1=-2, axis2=-1)
     expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
     # Smoothed noise has fewer independent pixels.
-    scatter = expected * np.sqrt((1.0 + 4.0 * np.pi * sigma_px**2) / pixels)
+    scatter = expected * np.sqrt(shared_pixels(sigma_px) / pixels)
     signal = np.where(energy - expected > _SIGMAS * scatter, energy - expected, 0.0)
     own = signal / np.maximum(signal + expected, 1e-30)
     return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
@@ -154,11 +154,8 @@ def information_weights(gradient: Array, pixels: float, sigma_px: float, noise: 
 
 def find_agreement(tiles: TileStatistics, noise: TileNoise) -> Agreement:
     """Which tiles agree with the shift at which they were compared."""
-    shared = 1.0 + 4.0 * np.pi * tiles.sigma_px**2
-    count, weights = (
-        tiles.pixels,
-        information_weights(tiles.gradient, tiles.pixels, tiles.sigma_px, noise),
-    )
+    shared, count = shared_pixels(tiles.sigma_px), tiles.pixels
+    weights = information_weights(tiles.gradient, count, tiles.sigma_px, noise)
     gain = _bound_gain(tiles, noise, weights)
     raw = tiles.image - 2.0 * gain * tiles.common + gain**2 * tiles.reference
     # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.

@@ -45,6 +45,7 @@ from scipy.special import stdtrit
 from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.noise_spectrum import shared_pixels
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
@@ -500,7 +501,7 @@ def _compare(
     sums = tile_sums(level, window, pixels, shift, hessian, enough, weights)
     plain = sums
     if weights is not None:
-        sums = sums.weighted(weights, sums.hessian)
+        sums = sums.weighted(weights)
     fit = solve_step(geometry, sums)
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
@@ -517,7 +518,7 @@ def _find_chance_gradient(
     energy = geometry.total[:2, :2] * np.outer(geometry.gradient_share, geometry.gradient_share)
     pixels = max(min(float(geometry.total[3, 3]), float(enough)), 1.0)
     # Smoothed noise has fewer independent pixels.
-    chance = np.sqrt((1.0 + 4.0 * np.pi * level.sigma_px**2) / pixels)
+    chance = np.sqrt(shared_pixels(level.sigma_px) / pixels)
     values, vectors = np.linalg.eigh(information)
     by_chance = _CHANCE * chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
     if values[0] > by_chance[0]:

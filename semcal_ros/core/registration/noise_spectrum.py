@@ -41,6 +41,8 @@ __all__ = [
     "gaussian_taps",
     "measure_image",
     "measure_richest_parts",
+    "passed_variance",
+    "shared_pixels",
     "smooth",
 ]
 
@@ -222,6 +224,16 @@ def gaussian_taps(sigma_px: float) -> Array:
     reach = max(1, int(np.ceil(_REACH_SIGMAS * sigma_px)))
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
     return np.asarray(taps / taps.sum())
+
+
+def passed_variance(sigma_px: float) -> float:
+    """What :func:`smooth` leaves of a variance of white noise of one."""
+    return float(np.sum(gaussian_taps(sigma_px) ** 2)) ** 2
+
+
+def shared_pixels(sigma_px: float) -> float:
+    """How many pixels of white noise have one error in common after :func:`smooth`."""
+    return float(1.0 + 4.0 * np.pi * sigma_px**2)
 
 
 def smooth(image: Image, sigma_px: float) -> Image:

@@ -34,7 +34,13 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask, mad_si
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["CoarsePeak", "CoarseReference", "find_coarse_peaks", "remove_shading"]
+__all__ = [
+    "CoarsePeak",
+    "CoarseReference",
+    "find_coarse_peaks",
+    "parabola_vertex",
+    "remove_shading",
+]
 
 
 # Longest sides to which the images are reduced, tried one after the other: each step costs four
@@ -250,23 +256,22 @@ def _find_peaks_at(
     return peaks
 
 
+def parabola_vertex(before: float, centre: float, after: float) -> float:
+    """Where the parabola through a maximum and its neighbours has its vertex, samples from the maximum."""
+    curvature = before - 2.0 * centre + after
+    if curvature >= 0.0:
+        return 0.0
+    return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
+
+
 def _interpolate_vertex(score: Image, row: int, col: int) -> tuple[float, float]:
     """Vertex of the parabolas through the maximum and its neighbours along each axis."""
-
-    def along(before: float, centre: float, after: float) -> float:
-        curvature = before - 2.0 * centre + after
-        return (
-            0.0
-            if curvature >= 0.0
-            else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
-        )
-
     height, width = score.shape
     d_row = d_col = 0.0
     if 0 < row < height - 1:
-        d_row = along(score[row - 1, col], score[row, col], score[row + 1, col])
+        d_row = parabola_vertex(score[row - 1, col], score[row, col], score[row + 1, col])
     if 0 < col < width - 1:
-        d_col = along(score[row, col - 1], score[row, col], score[row, col + 1])
+        d_col = parabola_vertex(score[row, col - 1], score[row, col], score[row, col + 1])
     return row + d_row, col + d_col
 
 

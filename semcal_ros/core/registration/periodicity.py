@@ -33,7 +33,7 @@ from semcal_ros.core.registration.inverse_compositional import (
     align,
     tile_residual_energies,
 )
-from semcal_ros.core.registration.normalised_correlation import remove_shading
+from semcal_ros.core.registration.normalised_correlation import parabola_vertex, remove_shading
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
 
 __all__ = ["choose_period", "find_periods"]
@@ -48,7 +48,7 @@ _REPEATED = 0.6
 _DIP = 0.7
 # Sine of the least angle between two periods.
 _LEAST_ANGLE = 0.3
-# Shifts that are compared at most. Those that the prediction allows and that correlate best come first.
+# Shifts that are compared at most: those nearest to the prediction.
 _MOST_COMPARED = 16
 # How far the prediction reaches, in standard deviations.
 _REACH = 4.0
@@ -124,8 +124,8 @@ def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
         found.append(
             (
                 length,
-                x + _vertex(surface[row + 1, col : col + 3]),
-                y + _vertex(surface[row : row + 3, col + 1]),
+                x + parabola_vertex(*surface[row + 1, col : col + 3]),
+                y + parabola_vertex(*surface[row : row + 3, col + 1]),
             )
         )
     # Lags along the first row have their mirror image in it.
@@ -137,16 +137,8 @@ def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
         if mirrored[col] < max(surface[1, col - 1 : col + 2]):
             continue
         if float(mirrored[wide + 1 : col].min()) <= _DIP * mirrored[col]:
-            found.append((x, x + _vertex(mirrored[col - 1 : col + 2]), 0.0))
+            found.append((x, x + parabola_vertex(*mirrored[col - 1 : col + 2]), 0.0))
     return [(x, y) for _, x, y in sorted(found)]
-
-
-def _vertex(values: Array) -> float:
-    before, middle, after = values.tolist()
-    curvature = before - 2.0 * middle + after
-    return (
-        0.0 if curvature >= 0.0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))
-    )
 
 
 def choose_period(

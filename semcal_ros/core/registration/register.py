@@ -48,9 +48,9 @@ from semcal_ros.core.registration.inverse_compositional import (
 from semcal_ros.core.registration.mismatch import explain_deformation, explain_mismatch
 from semcal_ros.core.registration.noise_spectrum import (
     estimate_noise_variance,
-    gaussian_taps,
     measure_image,
     measure_richest_parts,
+    passed_variance,
 )
 from semcal_ros.core.registration.normalised_correlation import (
     CoarsePeak,
@@ -504,7 +504,7 @@ def _reject(failure: MatchFailure, reason: str) -> Registration:
 
 def _correct_correlation(reference: Reference, variance: float, alignment: Alignment) -> float:
     """Correlation that the noise-free images would have; ``variance`` is that of the image's noise."""
-    passed = float(np.sum(gaussian_taps(reference.levels[-1].sigma_px) ** 2)) ** 2
+    passed = passed_variance(reference.levels[-1].sigma_px)
     noise = reference.noise_variance * passed
     image_noise = variance * passed
     whole, image_whole = alignment.reference_variance, alignment.image_variance

@@ -52,6 +52,7 @@ __all__ = [
     "PyramidLevel",
     "TileSums",
     "TileWindow",
+    "band_of",
     "make_level",
     "tile_sums",
     "tile_window",
@@ -159,9 +160,9 @@ class TileSums:
     energy: Array
     hessian: Array
 
-    def weighted(self, weights: Array, hessian: Array) -> TileSums:
-        """The sums with weights (rows, cols) of the tiles, and the Hessian that belongs to them."""
-        return TileSums(self.cross * weights[..., None], self.energy * weights, hessian)
+    def weighted(self, weights: Array) -> TileSums:
+        """The sums with weights (rows, cols) of the tiles, which the Hessian has already."""
+        return TileSums(self.cross * weights[..., None], self.energy * weights, self.hessian)
 
 
 @dataclass(frozen=True)
@@ -189,13 +190,14 @@ class _Curvature:
     first: int
 
 
-def _band(sigma_px: float) -> Band:
+def band_of(sigma_px: float) -> Band:
+    """Return the filters for an image that was smoothed by ``sigma_px``."""
     return SHARP if sigma_px < _SHARP_PX else FINE
 
 
 def _margin(sigma_px: float) -> int:
     # What lies farther out than that has four per cent of a Gaussian's weight.
-    return _band(sigma_px).reach + int(np.ceil(1.5 * sigma_px))
+    return band_of(sigma_px).reach + int(np.ceil(1.5 * sigma_px))
 
 
 def _tile_side(length: int) -> int:
@@ -220,7 +222,7 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel |
     cols, rows = inside[0] // side_x, inside[1] // side_y
     smoothed = smooth(image, sigma_px)
     mean = float(smoothed.mean(dtype=np.float64))
-    planes = np.stack([*gradients(smoothed, _band(sigma_px)), smoothed - np.float32(mean)])
+    planes = np.stack([*gradients(smoothed, band_of(sigma_px)), smoothed - np.float32(mean)])
     left = margin + (inside[0] - cols * side_x) // 2
     top = margin + (inside[1] - rows * side_y) // 2
     cut = planes[:, top : top + rows * side_y, left : left + cols * side_x]
@@ -332,7 +334,7 @@ def tile_sums(
     )
     count = cols.stop - cols.start, rows.stop - rows.start
     fraction = np.asarray(shift - whole, dtype=np.float64)
-    band, smoothing = _band(level.sigma_px), gaussian_taps(level.sigma_px)
+    band, smoothing = band_of(level.sigma_px), gaussian_taps(level.sigma_px)
     sampled = sample_tiles(image, corner, count, level.side, fraction, smoothing, band)
     if hessian is None and weights is not None:
         hessian = np.einsum("rc,rcij->ij", weights, _tile_hessians(level, window, sampled))
@@ -382,7 +384,7 @@ def _pick_rows(level: PyramidLevel, window: TileWindow, enough: int) -> tuple[In
     """Rows of tiles with enough pixels, in bands of equal height, and the lines at either end of a band that
     do not count, because their derivatives reach beyond it.
     """
-    rows, band = len(window.y), _band(level.sigma_px)
+    rows, band = len(window.y), band_of(level.sigma_px)
     lines = -(-enough // (len(window.x) * level.side[0] * _HESSIAN_BANDS)) + 2 * band.reach
     tall = -(-lines // level.side[1])
     if tall * _HESSIAN_BANDS >= rows:
@@ -395,7 +397,7 @@ def _compute_curvature(
     level: PyramidLevel, rows: slice, cols: slice | None, picked: Indices, unused: int
 ) -> _Curvature:
     columns = slice(0, level.products.shape[1]) if cols is None else cols
-    (side_x, side_y), band = level.side, _band(level.sigma_px)
+    (side_x, side_y), band = level.side, band_of(level.sigma_px)
     tiles = level.products[rows, columns][picked, :, :2]
     count, across = tiles.shape[:2]
     planes = tiles.reshape(count, across, 2, side_y, side_x).transpose(2, 0, 3, 1, 4)
