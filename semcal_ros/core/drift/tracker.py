@@ -324,8 +324,13 @@ class DriftTracker:
         if overlay is None or overlay.shape != old.frame.image.shape[:2]:
             return
         frame = replace(old.frame, image=remove_overlay(old.frame.image, overlay))
-        image, region = self._corrector.corrected_image(frame, old.removed, old.turn)
-        keyframe = make_keyframe(frame, old.removed, image, region, old.time_s, old.turn)
+        self._remake_keyframe(track, key, frame, old.removed)
+
+    def _remake_keyframe(self, track: _Track, key: int, frame: ScanFrame, removed: Array) -> None:
+        """Replace a keyframe by one of a single frame, freed of a motion."""
+        old = track.store[key]
+        image, region = self._corrector.corrected_image(frame, removed, old.turn)
+        keyframe = make_keyframe(frame, removed, image, region, old.time_s, old.turn)
         track.store.replace(key, keyframe)
 
     # -- the first frame --------------------------------------------------------------------------
@@ -500,11 +505,8 @@ class DriftTracker:
     def _forget_mean(self, track: _Track, key: int) -> None:
         """Go back to the first frame of a keyframe: the mean is of frames that were turned."""
         old = track.store[key]
-        if old.averaged == 1:
-            return
-        image, region = self._corrector.corrected_image(old.frame, old.removed, old.turn)
-        first = make_keyframe(old.frame, old.removed, image, region, old.time_s, old.turn)
-        track.store.replace(key, first)
+        if old.averaged > 1:
+            self._remake_keyframe(track, key, old.frame, old.removed)
 
     def _match_once(
         self, track: _Track, frame: ScanFrame, candidate: Candidate, motion: Array, turn: Array
@@ -560,11 +562,7 @@ class DriftTracker:
             or not _is_removable(removed, keyframe.frame)
         ):
             return False
-        image, region = self._corrector.corrected_image(keyframe.frame, removed, keyframe.turn)
-        corrected = make_keyframe(
-            keyframe.frame, removed, image, region, keyframe.time_s, keyframe.turn
-        )
-        track.store.replace(candidate.key, corrected)
+        self._remake_keyframe(track, candidate.key, keyframe.frame, removed)
         term_s2 = keyframe.frame.acceleration_term_s2
         track.filter.apply(CorrectShear(candidate.key, remaining, term_s2))
         return True
