@@ -404,15 +404,20 @@ def _align(
         # Far from the right shift the gradients have less in common.
         hessian = comparison.sums.hessian if comparison.length < _MAX_STEP_PX else None
         covariance = _covariance(comparison)
-        sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
-        remaining = _CONTRACTION * comparison.length + _CURVATURE * comparison.length**2
-        converged = remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
+        converged = _has_converged(comparison, covariance)
         if converged:
             break
     assert isinstance(comparison, _Comparison)
     found = comparison.fit.information
     chance = _find_chance_gradient(comparison.level, comparison.geometry, found, enough)
     return chance or _summarise(comparison, covariance, converged, passes)
+
+
+def _has_converged(comparison: _Comparison, covariance: Array) -> bool:
+    """Whether what remains after a step is little against the sigma of the shift in its better direction."""
+    sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
+    remaining = _CONTRACTION * comparison.length + _CURVATURE * comparison.length**2
+    return remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
 
 
 def align_reweighted(
@@ -462,9 +467,7 @@ def align_reweighted(
         before = weights[statistics.rows, statistics.cols]
         is_same = bool(np.array_equal(found, before))
         covariance = _covariance(comparison)
-        sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
-        remaining = _CONTRACTION * comparison.length + _CURVATURE * comparison.length**2
-        converged = remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
+        converged = _has_converged(comparison, covariance)
         if converged and (is_same or passes >= _MAX_REWEIGHTED):
             break
         if passes < _MAX_REWEIGHTED or not converged:
