@@ -46,7 +46,8 @@ def squares_and_pattern(command: Command) -> Command:
         type=click.Choice(PATTERNS),
         default="auto",
         show_default=True,
-        help="What the grid consists of: chess squares, dots or holes, crosses, or crossed lines.",
+        help="What the grid consists of: chess squares, dots or holes, crosses, crossed lines, or a grating of "
+        "parallel lines, which is turned and not tilted.",
     )
     squares = squares_option(
         "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."

@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
+    "MEDIAN_CHI2",
     "MEDIAN_CHI2_2",
     "RESAMPLED_TYPES",
     "AnyImage",
@@ -65,6 +66,8 @@ RESAMPLED_TYPES = ("uint8", "uint16", "float32")
 #: Median of a chi-square with two degrees of freedom, 2 ln 2: of the squared length of a normal
 #: vector in the plane, in variances per axis.
 MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
+#: The same by the number of degrees of freedom: of the square of one normal deviate, and of two.
+MEDIAN_CHI2 = {1: 0.45493642, 2: MEDIAN_CHI2_2}
 
 # Standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
 _SIGMAS_PER_MAD = 1.4826

@@ -459,8 +459,9 @@ def calibrate(
         As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
         is ``method_options``.
     pattern
-        What the grid consists of: ``"chess"``, ``"dots"`` (also holes), ``"lines"`` (crossed), or
-        ``"auto"``. Of dots and lines, ``squares_m`` is the distance from one to the next.
+        What the grid consists of: ``"chess"``, ``"dots"`` (also holes), ``"crosses"``, ``"lines"`` (crossed),
+        ``"grating"`` (parallel lines, turned and not tilted), or ``"auto"``. Of all but chess boards,
+        ``squares_m`` is the distance from one to the next.
     dask
         Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers find the corners.
     on_progress

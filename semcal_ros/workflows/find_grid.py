@@ -268,8 +268,8 @@ def collect_views(
         raise CalibrationError(
             f"no usable view among {counted(len(rejected), 'image')}"
             + (f" ({group_reasons(rejected)})" if rejected else ""),
-            expected="images of a grid: a chess board, dots, crosses or crossed lines",
-            do="choose --pattern auto, or the right images"
+            expected="images of a grid: a chess board, dots, crosses, crossed or parallel lines",
+            do="set --pattern to what is seen, or choose the right images"
             if other_pattern
             else "check focus, contrast, and that the grid fills the image",
         )

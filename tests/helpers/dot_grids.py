@@ -28,7 +28,7 @@ from tests.helpers.corner_boards import Board
 
 @dataclass(frozen=True)
 class PatternBoard(Board):
-    """A grid of dots or of lines with spacing ``square_px``, seen by a tilted, distorted camera.
+    """A grid of dots or lines, or a grating, with spacing ``square_px``, seen by a tilted, distorted camera.
 
     ``size`` is the diameter of the dots, or the width of the lines, in spacings; ``contrast`` is the
     difference between dots and background, and ``noise`` the 1-sigma at the mean level, both in
@@ -50,6 +50,8 @@ class PatternBoard(Board):
         off = np.abs(uv - nearest)
         if self.pattern == "dots":
             marked = np.hypot(off[:, 0], off[:, 1]) < self.size / 2.0
+        elif self.pattern == "grating":
+            marked = off[:, 0] < self.size / 2.0
         else:
             marked = off.min(axis=1) < self.size / 2.0
         for i, j in self.missing:

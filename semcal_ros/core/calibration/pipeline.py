@@ -141,6 +141,7 @@ def calibrate_views(
         For breakpoints outside the magnifications of the views.
     """
     options = options or CalibrationOptions()
+    views, options, lines = _prepare_lines(views, options)
     ordered = _check_views(views, options)
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _check_breakpoints(options.breakpoints, magnifications)
@@ -150,6 +151,11 @@ def calibrate_views(
     _check_scale(setup, factor)
     if priors is None:
         setup = adapt_priors(setup)
+    if ordered[0].across is not None:
+        # Axes are compared between views here, so that a height counts as a difference of the axes. Turning a grating
+        # changes the height by what the focus leaves, and a tilt has no part in it.
+        own = replace(setup.priors, height_sigma_m=options.height_sigma_m)
+        setup = replace(setup, priors=own)
     if options.method == "joint":
         setup = replace(setup, axis=options.axis)
         setup = add_shared_unknowns(align_lattices(mark_untilted(setup, options.untilted)))
@@ -159,6 +165,7 @@ def calibrate_views(
         _check_converged(setup, fit, factor)
         return judge(setup, fit, options, None, ())
     joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+    notes += lines
     fit = describe_fit(setup, joint)
     if options.untilted == "auto":
         notes += _propose_untilted(setup, joint, fit)
@@ -187,6 +194,65 @@ def are_enough(views: Sequence[GridView], options: CalibrationOptions) -> bool:
     named = set() if isinstance(options.untilted, str) else set(options.untilted)
     known = options.untilted == "all" or all(v.has_stage_tilt or v.name in named for v in views)
     return bool(views) and known and options.method == "joint"
+
+
+# Largest tilt that the stage may say of a grating: it shortens the lines' distance by 1.5e-4.
+_FLAT_RAD = np.radians(1.0)
+# Part of the largest singular value below which views of lines leave a linear distortion to its prior: where all lines
+# run within 10 degrees of each other, or in two directions only, it is 0.02 or less.
+_DETERMINED = 0.05
+
+
+def _prepare_lines(
+    views: Sequence[GridView], options: CalibrationOptions
+) -> tuple[Sequence[GridView], CalibrationOptions, list[Finding]]:
+    """Take views of a grating as untilted, since lines do not tell a tilt, and say what their directions leave open."""
+    if not any(view.across is not None for view in views):
+        return views, options, []
+    if options.method != "joint" or options.untilted == "none":
+        raise CalibrationError(
+            f"views of parallel lines, with method {options.method} and untilted {options.untilted}",
+            expected="method joint, and views that are not tilted",
+            do="turn the grating instead of tilting it, or use a grid of two directions",
+        )
+    for view in views:
+        tilt = 0.0 if view.stage is None or view.stage.tilt_rad is None else view.stage.tilt_rad
+        if abs(tilt) > _FLAT_RAD:
+            raise CalibrationError(
+                f"view {view.name} of parallel lines, tilted by {np.degrees(tilt):.1f} degrees",
+                expected="untilted views: what a tilt does to lines in one direction, another scale does as well",
+                do="leave this view out, or use a grid of two directions",
+            )
+    flat = tuple(replace(view, stage=None) for view in views)
+    return flat, replace(options, untilted="all"), _find_open_directions(flat)
+
+
+def _find_open_directions(views: Sequence[GridView]) -> list[Finding]:
+    """Return a finding if the directions of lines leave a part of the linear distortion to its prior.
+
+    Raises
+    ------
+    CalibrationError
+        If all lines run in one direction.
+    """
+    across = np.stack([np.mean(view.across, axis=0) for view in views if view.across is not None])
+    x, y = (across / np.linalg.norm(across, axis=1, keepdims=True)).T
+    # The distance of lines changes with the stretch along both axes, and with the shear.
+    values = np.linalg.svd(np.stack([x * x, y * y, x * y], axis=1), compute_uv=False)
+    known = int(np.sum(values > _DETERMINED * values[0]))
+    if known >= 3:
+        return []
+    if known == 1:
+        raise CalibrationError(
+            "parallel lines that run in one direction in all views, so that lengths along them are not known",
+            expected="lines in at least two directions, best in three",
+            do="add views with the grating turned by 90 and by 45 degrees",
+        )
+    text = (
+        "scale: the lines run in two directions only, which leaves a combination of pixel sizes and skew to its "
+        "prior: add views with the grating turned to a third direction, best by 45 degrees"
+    )
+    return [Finding(text)]
 
 
 def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tuple[GridView, ...]:

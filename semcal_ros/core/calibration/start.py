@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Mask
+from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Mask
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import SMOOTH, refit_functions
 from semcal_ros.core.calibration.estimator.poses import (
@@ -355,8 +355,9 @@ def measure_misfit_px(setup: Setup) -> float:
     for view in setup.views:
         ones = np.ones((len(view.board_xy_m), 1))
         seen = np.hstack([view.board_xy_m, ones]) @ fit_homography(view.board_xy_m, view.image_xy).T
-        square = np.sum((view.image_xy - seen[:, :2] / seen[:, 2:]) ** 2, axis=1)
-        variance = float(np.median(square)) / MEDIAN_CHI2_2 - float(np.median(view.sigma_px)) ** 2
+        left = view.known_residuals(view.image_xy - seen[:, :2] / seen[:, 2:])
+        median = float(np.median(np.sum(left**2, axis=1)))
+        variance = median / MEDIAN_CHI2[view.dimensions] - float(np.median(view.sigma_px)) ** 2
         worst = max(worst, variance)
     return float(np.sqrt(worst))
 

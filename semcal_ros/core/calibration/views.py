@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from semcal_ros.core.arrays import MEDIAN_CHI2_2, AnyImage, Array, Mask, check_positive
+from semcal_ros.core.arrays import MEDIAN_CHI2, AnyImage, Array, Mask, check_positive
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
@@ -79,6 +79,9 @@ class GridView:
         Whether the specimen is known not to be tilted.
     excess_px
         Part of the sigmas that :meth:`add_excess_noise` has added, px per axis.
+    across
+        (n, 2) unit vectors across the lines of a grating, the only direction in which its points are known; None
+        where both are.
     """
 
     magnification: float
@@ -92,6 +95,7 @@ class GridView:
     stage: StageReading | None = None
     untilted: bool = False
     excess_px: float = 0.0
+    across: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.board_xy_m)
@@ -151,7 +155,19 @@ class GridView:
             image_xy=self.image_xy[keep],
             sigma_px=self.sigma_px[keep],
             covariance_px2=spread,
+            across=None if self.across is None else self.across[keep],
         )
+
+    @property
+    def dimensions(self) -> int:
+        """In how many directions each point is known: 1 for lines, 2 else."""
+        return 2 if self.across is None else 1
+
+    def known_residuals(self, residuals_px: Array) -> Array:
+        """Return (n, dimensions) residuals along the directions that are known, of (n, 2)."""
+        if self.across is None:
+            return residuals_px
+        return np.sum(residuals_px * self.across, axis=1, keepdims=True)
 
 
 def _all_positive(covariance: Array, n: int) -> bool:
@@ -361,6 +377,8 @@ def views_from_detections(
             visit,
             float(square),
             stage,
+            untilted=bool(len(d.across)),
+            across=d.across if len(d.across) else None,
         )
         for d, g, square, label, stage, visit in zip(
             detections,
@@ -391,13 +409,14 @@ def estimate_excess_sigma_px(
     views
         Views with n corners together.
     residuals_px
-        (n, 2) residuals of a fit.
+        (n, 2) residuals of a fit, in the directions that are known.
     unknowns
         Number of fitted unknowns, which make the residuals smaller than the errors.
     """
     own = np.concatenate([v.sigma_px for v in views]) ** 2
     square = np.sum(residuals_px**2, axis=1)
-    target: float = MEDIAN_CHI2_2 * max(1.0 - unknowns / (2.0 * len(square)), 0.1)
+    dimensions = views[0].dimensions
+    target: float = MEDIAN_CHI2[dimensions] * max(1.0 - unknowns / (dimensions * len(square)), 0.1)
 
     def surplus(variance: float) -> float:
         ratio = float(np.median(square / (own + variance)))

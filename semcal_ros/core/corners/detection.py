@@ -39,6 +39,7 @@ from semcal_ros.core.corners.dots_and_lines import (
     refine_cells,
     split_mixture,
 )
+from semcal_ros.core.corners.grating import find_lines, fit_directions
 from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
@@ -100,7 +101,15 @@ _CELL_FULL_PX = 80.0
 # Least distance of points in a reduced picture, px.
 _SPACING_MIN_PX = 10.0
 
-_POINTS = {"chess": "corners", "dots": "dots", "crosses": "crosses", "lines": "crossings"}
+_POINTS = {
+    "chess": "corners",
+    "dots": "dots",
+    "crosses": "crosses",
+    "lines": "crossings",
+    "grating": "places on lines",
+}
+# 1-sigma along the lines of a grating, in sides of the picture: a million places tell lengths along them to 10 %.
+_ALONG = 30.0
 
 
 def _no_covariance() -> Array:
@@ -136,9 +145,13 @@ class LatticeDetection:
     rejected_xy
         (k, 2) expected positions of lattice points in the image that were rejected, px.
     pattern
-        What the points are: corners of a chess board, centres of dots or crosses, or crossings of lines.
+        What the points are: corners of a chess board, centres of dots or crosses, crossings of lines, or places on
+        parallel lines.
     odds
         How many times as likely this pattern is as the next one; at most a million.
+    across
+        (n, 2) unit vectors across the lines of a grating, along which alone the positions are known, and to which
+        ``sigma_px`` refers; (0, 2) for other patterns.
     """
 
     ij: Indices
@@ -151,6 +164,7 @@ class LatticeDetection:
     rejected_xy: Array = field(default_factory=_no_positions)
     pattern: Pattern = "chess"
     odds: float = float("nan")
+    across: Array = field(default_factory=_no_positions)
 
     @property
     def rejected(self) -> int:
@@ -177,7 +191,7 @@ def find_lattice(
         Rows at the bottom that do not belong to the image.
     pattern
         "chess", "dots" (also holes and small squares), "crosses", "lines" (crossed), or "auto" for whichever of these
-        is seen.
+        is seen; or "grating" for parallel lines, of which "auto" only says that it sees them.
 
     Returns
     -------
@@ -196,8 +210,11 @@ def find_lattice(
     if isinstance(scaled, Rejection):
         return scaled
     pyramid = _Pyramid(scaled)
+    if wanted == "grating":
+        return _find_grating(pyramid)
     answer: Rejection[LatticeStatus] | None = None
     best: LatticeDetection | None = None
+    is_clear = False
     for candidate in _rank(list(_search(pyramid))):
         for shape in _likely_shapes(candidate, wanted):
             found = shape if isinstance(shape, Rejection) else _measure(pyramid, candidate, shape)
@@ -205,13 +222,46 @@ def find_lattice(
                 # What is said is said of the candidate that covers most of the image.
                 answer = answer or found
             elif best is None or _filled_by(found) > _filled_by(best):
-                best = found
+                best, is_clear = found, candidate.is_clear
         if best is not None and candidate.filled > 0.5 * _FILLED:
             break
+    if best is not None and is_clear:
+        return best
+    # Noise between parallel lines makes lattices too.
+    if wanted == "auto" and isinstance(find_lines(pyramid.level, pyramid.size), Lattice):
+        return Rejection(
+            LatticeStatus.OTHER_PATTERN,
+            "parallel lines, which do not tell a tilt: if the specimen was not tilted, set the pattern to grating",
+        )
     if best is not None:
         return best
     what = "points" if wanted == "auto" else _POINTS[wanted]
     return answer or Rejection(LatticeStatus.NO_LATTICE, f"no grid: no regular pattern of {what}")
+
+
+def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStatus]:
+    """Find parallel lines, and fit their positions at places as far apart as the lines."""
+    lines = find_lines(pyramid.level, pyramid.size)
+    if isinstance(lines, Rejection):
+        return lines
+    shape = CellShape("grating", True, float("nan"), float("nan"), 0.0)
+    whole = _Candidate(lines, lines, None, 1.0, 1.0, False)
+    found = _measure(pyramid, whole, shape)
+    if isinstance(found, Rejection):
+        return found
+    along = fit_directions(found.ij, found.xy)
+    across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    variance = np.einsum("ni,nij,nj->n", across, found.covariance_px2, across)
+    scatter = estimate_scatter_px(found.ij, found.xy, found.covariance_px2, dimensions=1)
+    variance = variance + scatter**2
+    far = np.full(len(along), (_ALONG * max(found.image_size)) ** 2)
+    # Places are numbered from anywhere along the lines. One of them counts as known, so that the numbers have a place.
+    middle = 0.5 * (np.array(found.image_size) - 1.0)
+    nearest = int(np.argmin(np.sum((found.xy - middle) ** 2, axis=1)))
+    far[nearest] = variance[nearest]
+    covariance = variance[:, None, None] * across[:, :, None] * across[:, None, :]
+    covariance += far[:, None, None] * along[:, :, None] * along[:, None, :]
+    return replace(found, covariance_px2=covariance, sigma_px=np.sqrt(variance), across=across)
 
 
 class _Pyramid:
@@ -458,7 +508,10 @@ def _make_detection(
         corners.ij[nearest : nearest + 1], corners.ij, corners.xy, leave_out_self=False
     )
     spacing = float(np.linalg.svd(maps.axes[0], compute_uv=False)[0])
-    scatter = estimate_scatter_px(corners.ij, corners.xy, corners.covariance)
+    # Of lines, the scatter is estimated across them.
+    scatter = 0.0
+    if pattern != "grating":
+        scatter = estimate_scatter_px(corners.ij, corners.xy, corners.covariance)
     covariance = corners.covariance + scatter**2 * np.eye(2)
     trace = np.trace(covariance, axis1=1, axis2=2)
     return LatticeDetection(

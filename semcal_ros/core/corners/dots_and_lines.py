@@ -52,6 +52,7 @@ from semcal_ros.core.corners.unit_cell import (
     fit_cells,
     gather_cells,
 )
+from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = [
     "bright_cells",
@@ -241,11 +242,12 @@ def refine_cells(image: Array32, cells: Lattice, shape: CellShape) -> RefinedCor
     image
         (h, w) float32 with a contrast of about 1.
     cells
-        Bright places of the pattern.
+        Bright places of the pattern, or any of parallel lines.
     shape
-        Its shape. Dots are located at their centres, lines where they cross.
+        Its shape. Dots are located at their centres, lines where they cross, and parallel lines at any place along
+        them, where their positions stay as they are.
     """
-    learnt = _learn(image, _at_feature(cells, shape))
+    learnt = _learn(image, _at_feature(cells, shape), shape.pattern == "grating")
     if learnt is None:
         return None
     rough, cell, noise = learnt
@@ -298,7 +300,9 @@ def _at_feature(cells: Lattice, shape: CellShape) -> Lattice:
     return Lattice(cells.ij, half, maps.axes).select(maps.usable)
 
 
-def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseModel] | None:
+def _learn(
+    image: Array32, cells: Lattice, is_grating: bool
+) -> tuple[Lattice, UnitCell, NoiseModel] | None:
     """Learn the mean cell and the noise from some cells; also return all cells, centred."""
     if len(cells.ij) < CORNERS_MIN:
         return None
@@ -309,7 +313,8 @@ def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseMode
     some = maps.select(few)
     windows = gather_cells(image, some)
     # The first round weighs all pixels equally.
-    cell = average_cells(windows, some, None)
+    average = _average_lines if is_grating else average_cells
+    cell = average(windows, some, None)
     fit = fit_cells(windows, some, cell, None, iterations=2)
     for left in range(MEAN_ROUNDS - 1, -1, -1):
         typical = float(np.median(fit.gain))
@@ -318,7 +323,7 @@ def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseMode
             return None
         noise = fit_noise(fit.select(good))
         some, windows, fit = some.select(good), windows.select(good), fit.select(good)
-        cell = average_cells(windows, some, fit)
+        cell = average(windows, some, fit)
         if not np.any(cell.values):
             # Noise explains all that they have in common.
             return None
@@ -328,6 +333,10 @@ def _learn(image: Array32, cells: Lattice) -> tuple[Lattice, UnitCell, NoiseMode
     # The spline has the scale of the mean gain, which is about 1.
     centred = maps.xy + u * maps.axes[:, 0] + v * maps.axes[:, 1]
     return Lattice(cells.ij, centred, maps.axes), cell.shift(u, v), noise
+
+
+def _average_lines(windows: PixelWindows, maps: LocalMaps, fit: CellFit | None) -> UnitCell:
+    return average_cells(windows, maps, fit).average_along()
 
 
 @dataclass(frozen=True)

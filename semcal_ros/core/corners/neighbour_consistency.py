@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, Mask
+from semcal_ros.core.arrays import MEDIAN_CHI2, MEDIAN_CHI2_2, Array, Indices, Mask
 from semcal_ros.core.corners.checks import CORNERS_MIN, inflate_variance
 from semcal_ros.core.corners.corner_fit import PositionFit
 from semcal_ros.core.corners.local_map import SUPPORT_MIN, LocalMaps, fit_local_maps
@@ -36,6 +36,9 @@ MAP_ERROR_PX = 2.0
 MAP_ERROR_RATIO = 4.0
 # Scatter beyond that of chance: once in 400 images of a regular grid with independent errors.
 SCATTER_SIGMAS = 2.8
+# Relative 1-sigma of the median of n chi-squares by their degrees of freedom, times sqrt(n): half the inverse of the
+# density at the median, over the median.
+MEDIAN_SIGMA = {1: 2.333, 2: 1.0 / np.log(2.0)}
 # A trend of this degree follows smooth distortions and perspectives to a few hundredths of a pixel.
 # Twice as many corners as terms keep single corners from bending it.
 TREND_DEGREE = 5
@@ -72,7 +75,7 @@ def _agree_with_neighbours(
     return passed & (maps.support >= SUPPORT_MIN)
 
 
-def estimate_scatter_px(cells: Indices, xy: Array, covariance: Array) -> float:
+def estimate_scatter_px(cells: Indices, xy: Array, covariance: Array, dimensions: int = 2) -> float:
     """Estimate by how much points scatter about their neighbours beyond their covariances, 1-sigma per axis in px.
 
     Pixel noise does not tell it: edges are rough, debris lies beside them, and lines jitter. The result is 0 where
@@ -82,6 +85,8 @@ def estimate_scatter_px(cells: Indices, xy: Array, covariance: Array) -> float:
     ----------
     cells, xy, covariance
         (n, 2), (n, 2) and (n, 2, 2) of the points.
+    dimensions
+        In how many directions they are known: one for places on lines, whose other direction has a far larger variance.
     """
     flat = xy - _trend(cells, np.ones(len(cells), dtype=np.bool_), xy, 1)
     # Whatever a smooth model leaves of the distortion looks like scatter: the model that leaves least counts.
@@ -89,16 +94,15 @@ def estimate_scatter_px(cells: Indices, xy: Array, covariance: Array) -> float:
     scores += [
         _score_trend(cells, flat, covariance, degree) for degree in range(2, TREND_DEGREE + 1)
     ]
-    excess = min(scores) - 1.0
-    # The median of n chi-squares of two degrees of freedom has a relative 1-sigma of 1 / (ln 2 sqrt(n)).
-    if not 0.0 < SCATTER_SIGMAS / (np.log(2.0) * np.sqrt(len(cells))) < excess < np.inf:
+    excess = min(scores) / MEDIAN_CHI2[dimensions] - 1.0
+    if not 0.0 < SCATTER_SIGMAS * MEDIAN_SIGMA[dimensions] / np.sqrt(len(cells)) < excess < np.inf:
         return 0.0
-    variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
-    return float(np.sqrt(excess * np.median(variance)))
+    variances = np.linalg.eigvalsh(covariance)[:, :dimensions]
+    return float(np.sqrt(excess * np.median(variances.mean(axis=1))))
 
 
 def _score_lens(xy: Array, flat: Array, covariance: Array) -> float:
-    """Return the variance, about a perspective with radial and decentring distortion, relative to the covariances."""
+    """Return the median chi-square about a perspective with radial and decentring distortion."""
     x, y = ((xy - xy.mean(axis=0)) / np.std(xy)).T
     none, one, square = np.zeros_like(x), np.ones_like(x), x * x + y * y
     columns = [
@@ -116,19 +120,19 @@ def _score_lens(xy: Array, flat: Array, covariance: Array) -> float:
         return np.inf
     target = flat.T.ravel()
     rest = (target - design @ np.linalg.lstsq(design, target, rcond=None)[0]).reshape(2, -1).T
-    median = float(np.median(_squared_mahalanobis(rest, covariance))) / MEDIAN_CHI2_2
+    median = float(np.median(_squared_mahalanobis(rest, covariance)))
     return median * design.shape[0] / freedom
 
 
 def _score_neighbours(cells: Indices, flat: Array, covariance: Array) -> float:
-    """Return the variance, about predictions of neighbours, relative to the covariances; infinite without any."""
+    """Return the median chi-square about predictions of neighbours; infinite without any."""
     rest = flat - _trend(cells, np.ones(len(cells), dtype=np.bool_), flat)
     maps = fit_local_maps(cells, cells, rest)
     told = maps.support >= SUPPORT_MIN
     if told.sum() < CORNERS_MIN:
         return np.inf
     miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
-    return float(np.median(_squared_mahalanobis(miss, covariance)[told])) / MEDIAN_CHI2_2
+    return float(np.median(_squared_mahalanobis(miss, covariance)[told]))
 
 
 def _score_trend(cells: Indices, flat: Array, covariance: Array, degree: int) -> float:
@@ -137,7 +141,7 @@ def _score_trend(cells: Indices, flat: Array, covariance: Array, degree: int) ->
     if 2 * terms > count:
         return np.inf
     rest = flat - _trend(cells, np.ones(count, dtype=np.bool_), flat, degree)
-    median = float(np.median(_squared_mahalanobis(rest, covariance))) / MEDIAN_CHI2_2
+    median = float(np.median(_squared_mahalanobis(rest, covariance)))
     return median * count / (count - terms)
 
 

@@ -47,16 +47,17 @@ __all__ = [
 ]
 
 #: What a grid consists of.
-Pattern = Literal["chess", "dots", "crosses", "lines"]
+Pattern = Literal["chess", "dots", "crosses", "lines", "grating"]
 #: What to search for.
-PatternChoice = Literal["auto", "chess", "dots", "crosses", "lines"]
-PATTERNS = ("auto", "chess", "dots", "crosses", "lines")
+PatternChoice = Literal["auto", "chess", "dots", "crosses", "lines", "grating"]
+PATTERNS = ("auto", "chess", "dots", "crosses", "lines", "grating")
 #: What they are called.
 PATTERN_NAMES = {
     "chess": "a chess board",
     "dots": "dots",
     "crosses": "crosses",
     "lines": "crossed lines",
+    "grating": "parallel lines",
 }
 
 # Harmonics up to this order: with more, small spacings would be judged by noise.

@@ -92,8 +92,13 @@ class UnitCell:
         phase = np.exp(2j * np.pi * (u * order[:, None] + v * order[None, :]))
         return UnitCell(np.real(np.fft.ifft2(np.fft.fft2(self.values) * phase)))
 
+    def average_along(self) -> UnitCell:
+        """Return the cell of parallel lines: the mean over j."""
+        mean = self.values.mean(axis=1, keepdims=True)
+        return UnitCell(np.broadcast_to(mean, self.values.shape).copy())
+
     def find_centre(self) -> tuple[float, float]:
-        """Return the centre of symmetry near the lattice point, in cells.
+        """Return the centre of symmetry near the lattice point, in cells; zero where it is free.
 
         Half a turn about it takes each Fourier coefficient to its conjugate, so that the phases are
         linear in its position; the strong low orders determine it.
@@ -109,7 +114,7 @@ class UnitCell:
             phase = np.angle(known * np.where(known.real < 0.0, -1.0, 1.0))
             weight = np.abs(known) ** 2
             normal = basis.T @ (basis * weight[:, None])
-            centre = centre + np.linalg.solve(normal, basis.T @ (weight * phase))
+            centre = centre + np.linalg.pinv(normal, hermitian=True) @ (basis.T @ (weight * phase))
         return float(centre[0]), float(centre[1])
 
 
@@ -344,7 +349,8 @@ def _fit_block(
 ) -> CellFit:
     count, pixels = windows.x.shape
     inverse = np.linalg.inv(maps.axes.transpose(0, 2, 1)).astype(np.float32)
-    limit = STEP_MAX * np.linalg.norm(maps.axes, axis=2).min(axis=1)[:, None]
+    spacing = np.linalg.norm(maps.axes, axis=2).min(axis=1)[:, None]
+    limit = STEP_MAX * spacing
     jacobian = np.empty((count, PARAMETERS, pixels), dtype=np.float32)
     jacobian[:, 3] = 1.0
     jacobian[:, 4], jacobian[:, 5] = windows.x, windows.y
@@ -363,6 +369,10 @@ def _fit_block(
         weight = windows.valid if noise is None else windows.valid / noise.variance(model)
         residual = windows.value - model
         normal, right = normal_equations(jacobian, residual, weight)
+        # A position that nothing tells, as along a line, stays where it is.
+        for axis in (0, 1):
+            normal[:, axis, axis] += 1.0 / spacing[:, 0] ** 2
+            right[:, axis] -= moved[:, axis] / spacing[:, 0] ** 2
         covariance = np.linalg.inv(normal).astype(np.float64, copy=False)
         step = (covariance @ right[:, :, None])[:, :, 0]
         moved = moved + np.clip(step[:, :2], -limit, limit)

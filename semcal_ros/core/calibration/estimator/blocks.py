@@ -41,6 +41,7 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.scan_distortion import Raster
+from semcal_ros.core.errors import CalibrationError
 
 __all__ = [
     "GRID_NAMES",
@@ -235,6 +236,8 @@ class Problem:
         What varies besides the poses, or None where nothing does.
     attitudes
         What is known about the orientations of the views, or None.
+    across
+        (N, 2) the only direction in which each point is known, if it lies on a line of a grating; None where both are.
     """
 
     board_m: Array
@@ -253,6 +256,18 @@ class Problem:
     square_class: Indices | None = None
     effects: Effects | None = None
     attitudes: Attitudes | None = None
+    across: Array | None = None
+
+    @property
+    def dimensions(self) -> int:
+        """In how many directions each point is known."""
+        return 2 if self.across is None else 1
+
+    def known_part(self, residuals_px: Array) -> Array:
+        """Return residuals (N, 2) without the direction along lines, in which nothing was observed."""
+        if self.across is None:
+            return residuals_px
+        return self.across * np.sum(residuals_px * self.across, axis=1, keepdims=True)
 
     @cached_property
     def layout(self) -> Layout:
@@ -370,7 +385,19 @@ def make_problem(
         prior_mean=prior_mean,
         prior_sigma=prior_sigma,
         height_sigma_m=np.broadcast_to(np.asarray(height_sigma_m, dtype=np.float64), len(views)),
+        across=_directions(views),
     )
+
+
+def _directions(views: Sequence[GridView]) -> Array | None:
+    known = [v.across for v in views if v.across is not None]
+    if not known:
+        return None
+    if len(known) < len(views):
+        raise CalibrationError(
+            "views of a grating and of another grid", expected="views of one grid"
+        )
+    return np.concatenate(known)
 
 
 def retract(problem: Problem, state: State, change: Array, views: Array, visits: Array) -> State:
@@ -445,6 +472,7 @@ def select_views(problem: Problem, chosen: Mask) -> Problem:
         board_m=problem.board_m[points],
         observed_px=problem.observed_px[points],
         whitening=problem.whitening[points],
+        across=None if problem.across is None else problem.across[points],
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         group=problem.group[chosen],
         unit_m=problem.unit_m[chosen],

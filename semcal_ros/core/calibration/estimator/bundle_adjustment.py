@@ -100,7 +100,7 @@ class BundleResult:
     state
         Adjusted unknowns.
     residuals_px
-        (N, 2) observed minus projected pixels.
+        (N, 2) observed minus projected pixels; of points on lines, their part across these.
     huber_weight
         (N,) weights in [0, 1]: below 1 where a corner is an outlier, and 0 where it has no projection.
     cost
@@ -356,7 +356,7 @@ def _make_result(
         variance[name] = np.einsum("vrp,vpq,vrq->vr", rows, view_covariance, rows, optimize=True)
     return BundleResult(
         state=state,
-        residuals_px=normal.residuals_px,
+        residuals_px=problem.known_part(normal.residuals_px),
         huber_weight=normal.huber_weight,
         cost=cost,
         information=reduced.information,
@@ -427,7 +427,7 @@ def _make_singular_result(
     own = problem.layout.magnification.stop
     return BundleResult(
         state=state,
-        residuals_px=normal.residuals_px,
+        residuals_px=problem.known_part(normal.residuals_px),
         huber_weight=normal.huber_weight,
         cost=cost,
         information=np.zeros((groups, own, own)),
@@ -452,7 +452,7 @@ def variance_factor(problem: Problem, result: BundleResult) -> float:
     """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
     norm2 = weighted_squares(problem, result)
     unknowns = problem.layout.of_view.size * len(problem.group) + len(result.state.theta)
-    freedom = 2.0 * result.huber_weight.sum() - unknowns - result.state.visits.size
+    freedom = problem.dimensions * result.huber_weight.sum() - unknowns - result.state.visits.size
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))
 
 

@@ -324,8 +324,11 @@ def _view_costs(problem: Problem, result: BundleResult) -> Array:
 
 
 def thin_view(view: GridView) -> GridView:
-    """Return the view with a random part of its corners, enough for a pose and a rough camera."""
-    if len(view.board_xy_m) <= _ENOUGH_CORNERS:
+    """Return the view with a random part of its corners, enough for a pose and a rough camera.
+
+    Lines stay whole: a single place says where they are along their direction.
+    """
+    if len(view.board_xy_m) <= _ENOUGH_CORNERS or view.across is not None:
         return view
     keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:_ENOUGH_CORNERS]
     return view.chosen(keep)

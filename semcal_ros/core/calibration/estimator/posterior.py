@@ -83,6 +83,9 @@ _LARGEST_REMAINING = 1.0
 # Part of the prior variance of a constant beyond which the prior holds it.
 _HELD = 0.64
 _NAMED = 3
+# Square of the cosine between a line of the raster and the direction in which a point is known, below which a shift
+# along the line hardly shows there.
+_TELLING = 0.5
 
 
 def certify(functions: Functions, problem: Problem, result: BundleResult) -> Certificate:
@@ -193,7 +196,13 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
     squares = 0.0
     for part in _views(problem):
         inlier = result.huber_weight[part] >= 1.0
-        x = np.where(inlier, result.residuals_px[part, 0], 0.0)
+        x = result.residuals_px[part, 0]
+        if problem.across is not None:
+            # A shift of a line of the raster shows by its part across the lines of the grating.
+            by_x = problem.across[part, 0] ** 2
+            inlier = inlier & (by_x > _TELLING)
+            x = x / np.maximum(by_x, _TELLING)
+        x = np.where(inlier, x, 0.0)
         line = _lines(problem, part)
         sums, counts = (np.bincount(line, weights=w) for w in (x, inlier.astype(float)))
         own = min(len(sums), _MOST_LAG)

@@ -218,10 +218,14 @@ class Setup:
         return visit, np.searchsorted(self.magnifications, [g for g, _ in known]).astype(np.intp)
 
     @property
-    def is_rotation_known(self) -> bool:
-        """Whether the stage says of every view how far it is turned."""
+    def is_lattice_known(self) -> bool:
+        """Whether all views have the axes of the grid.
+
+        They do where the stage says of each how far it is turned, and where they show parallel lines.
+        """
         return all(
-            v.has_stage_tilt and v.stage is not None and v.stage.rotation_rad is not None
+            v.across is not None
+            or (v.has_stage_tilt and v.stage is not None and v.stage.rotation_rad is not None)
             for v in self.views
         )
 
@@ -365,7 +369,7 @@ class VarianceComponents:
         (V,) drift within each image, px per axis.
     lattice_sigma
         (2,) stretch and shear of the grid in the lattice of a view, which has one of four
-        directions by chance; None where the stage's rotation tells which.
+        directions by chance; None where all views have the axes of the grid.
     """
 
     scale: Spread
@@ -383,7 +387,7 @@ def initial_components(setup: Setup) -> VarianceComponents:
         Spread(priors.visit_height_sigma_m, 0.0),
         np.full(count, priors.height_sigma_m),
         np.full(count, setup.drift_sigma_px),
-        None if setup.is_rotation_known else usual_lattice_sigmas(priors),
+        None if setup.is_lattice_known else usual_lattice_sigmas(priors),
     )
 
 

@@ -112,8 +112,9 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
             residuals = result.prior_residuals["height"][own, 0] * sigma / sigma[0]
             variance = result.prior_variance["height"][own, 0]
             height[own] = _update(float(sigma[0]), priors.height_sigma_m, residuals, variance).sigma
-    if len(height) < _ENOUGH_HEIGHTS:
-        # Otherwise a height would widen its own prior, and a camera could run away with it.
+    if len(height) < _ENOUGH_HEIGHTS or problem.across is not None:
+        # Otherwise a height would widen its own prior, and a camera could run away with it: of lines, those in two
+        # directions can be at two heights as well as under an aspect ratio.
         height = np.minimum(height, priors.height_sigma_m)
     effects = problem.effects
     if effects is None:
@@ -157,9 +158,12 @@ def _drift_sigma(problem: Problem, result: BundleResult, usual: float) -> Array:
     A drift of the specimen is one in metres, that of the beam one in pixels. An effect that the
     data determine to ``1 - variance`` has so much of its variance as expected square. The drift that
     the views of a visit share does not count: nothing tells it from the aspect ratio and the skew, so
-    that it would widen its own prior.
+    that it would widen its own prior. Of lines in one direction even the drift of a single view cannot be told from
+    these, and keeps its usual spread.
     """
     assert problem.effects is not None
+    if problem.across is not None:
+        return np.full(len(problem.group), usual)
     sigma, visit = problem.effects.drift_sigma_px, problem.effects.visit
     drift = sigma[:, None] * result.prior_residuals["drift"]
     count = np.bincount(visit)

@@ -25,11 +25,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices
-from semcal_ros.core.calibration.estimator.blocks import State, make_problem
+from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Indices
+from semcal_ros.core.calibration.estimator.blocks import Problem, State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.estimator.poses import pose_from_camera
-from semcal_ros.core.calibration.estimator.problem import HELD_SIGMA
+from semcal_ros.core.calibration.estimator.problem import HELD_SIGMA, Priors
+from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -146,13 +147,13 @@ def compare_scales(
         prior_sigma=np.append(HELD_SIGMA, np.full(count, _FREE_SCALE)),
         height_sigma_m=height_sigma_m,
     )
+    problem = _hold_lines_flat(problem)
     theta = np.append(1.0, np.zeros(count))
     result = refine(problem, State(theta, poses.rotations, poses.translations_m))
     own = np.concatenate([v.sigma_px for v in views])
     # Corners that scatter more than they say make the scale as much less certain.
-    excess = max(
-        float(np.median(np.sum(result.residuals_px**2, axis=1) / own**2)) / MEDIAN_CHI2_2, 1.0
-    )
+    median = float(np.median(np.sum(result.residuals_px**2, axis=1) / own**2))
+    excess = max(median / MEDIAN_CHI2[problem.dimensions], 1.0)
     out = {}
     for k, (g, camera) in enumerate(zip(magnifications, cameras, strict=True)):
         sigma = np.sqrt(result.covariance[1 + k, 1 + k] * excess)
@@ -160,6 +161,15 @@ def compare_scales(
         parts = (sigma, camera.rho * visit_height_sigma_m, ours)
         out[float(g)] = ScaleError(float(result.state.theta[1 + k]), float(np.linalg.norm(parts)))
     return out
+
+
+def _hold_lines_flat(problem: Problem) -> Problem:
+    """Return the problem with views of a grating untilted: what a tilt does to lines, another scale does as well."""
+    if problem.across is None:
+        return problem
+    count = len(problem.group)
+    flat = attitudes([None] * count, [True] * count, StageAxis(), Priors().untilted_sigma_rad)
+    return replace(problem, attitudes=flat)
 
 
 # The tilt of a nearly flat view acts through its square, so its last degrees take many small steps.
@@ -196,6 +206,7 @@ def fit_poses(
         prior_sigma=np.ones(1),
         height_sigma_m=height_sigma_m,
     )
+    problem = _hold_lines_flat(problem)
     if starts is None:
         of_view = [cameras[k] for k in problem.group]
         both = [pose_from_camera(v, c) for v, c in zip(views, of_view, strict=True)]

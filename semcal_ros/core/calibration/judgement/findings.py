@@ -184,9 +184,9 @@ _MIN_IN_CELL = 5
 
 
 def normalise_residuals(result: CalibrationResult) -> Array:
-    """Divide residuals (n, 2) by the 1-sigma of their corners."""
-    sigma = np.concatenate([v.sigma_px for v in result.views])
-    return np.asarray(np.concatenate(result.fit.residuals_px) / sigma[:, None], dtype=np.float64)
+    """Divide residuals (n, 2), or (n, 1) across the lines of a grating, by the 1-sigma of their corners."""
+    own = zip(result.views, result.fit.residuals_px, strict=True)
+    return np.concatenate([v.known_residuals(r) / v.sigma_px[:, None] for v, r in own])
 
 
 def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
@@ -210,10 +210,11 @@ def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     spread = float(np.median(np.abs(normalise_residuals(result)))) / 0.6745
     chance = spread**2 / total
     squares = np.sum((sums / total[:, None]) ** 2, axis=1)
-    excess = float(np.mean(squares - 2.0 * chance))
+    expected = result.views[0].dimensions * chance
+    excess = float(np.mean(squares - expected))
     if not np.all(chance > 0.0):
         return 0.0, 1.0
-    return float(np.sqrt(max(excess, 0.0))), float(np.mean(squares / (2.0 * chance)))
+    return float(np.sqrt(max(excess, 0.0))), float(np.mean(squares / expected))
 
 
 # Part of the field without a corner that is worth a warning: about 5 of 108 cells of a 4:3 image.
@@ -287,7 +288,7 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
     bad = []
     for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        ratio = rms / float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
+        ratio = rms / float(np.sqrt(view.dimensions * np.mean(view.sigma_px**2)))
         if ratio > _VIEW_RATIO:
             bad.append((ratio, rms, view))
     if bad:
@@ -326,7 +327,7 @@ def _check_field(result: CalibrationResult) -> list[Finding]:
             )
         )
     largest = float(np.max(compute_tilts_deg(result)[0]))
-    if largest < _SMALL_TILT_DEG:
+    if largest < _SMALL_TILT_DEG and not _shows_lines(result):
         found.append(
             Finding(
                 f"no view is tilted by more than {largest:.1f} degrees: scale and height are hardly "
@@ -375,6 +376,11 @@ def _check_pattern(result: CalibrationResult) -> list[Finding]:
     return []
 
 
+def _shows_lines(result: CalibrationResult) -> bool:
+    """Whether the grid is a grating, which is turned and not tilted."""
+    return any(view.across is not None for view in result.views)
+
+
 def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
     """Check the magnification at which positions are least certain."""
     model = result.model
@@ -392,7 +398,8 @@ def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
         return [
             Finding(
                 f"around {float(f'{g:.2g}'):.10g}x positions at the edge of the image are uncertain "
-                f"by {worst[g]:.1f} px relative to its centre: take more images there, tilted in different directions",
+                f"by {worst[g]:.1f} px relative to its centre: take more images there, "
+                f"{'turned' if _shows_lines(result) else 'tilted'} in different directions",
                 worst[g],
                 magnification=g,
             )

@@ -172,7 +172,7 @@ def measure_excess(setup: Setup, fit: JointFit) -> tuple[float, float]:
     """RMS in px by which corners are off beyond their own noise, where that is most nm, and the magnification there."""
     problem, result = fit.adjustment.problem, fit.adjustment.result
     square = np.sum(result.residuals_px**2, axis=1)
-    expected = np.concatenate([2.0 * v.sigma_px**2 for v in setup.views])
+    expected = np.concatenate([v.dimensions * v.sigma_px**2 for v in setup.views])
     own = np.array([v.magnification for v in setup.views])[problem.view_of_point]
     inlier = result.huber_weight >= 1.0
     excess = {}

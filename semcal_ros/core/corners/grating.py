@@ -1,0 +1,306 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Find the lines of a grating, which are parallel, by their spatial frequency and its local phase.
+
+The strongest spatial frequency gives direction and period of the lines, and the phase of the picture at this frequency
+how far each place is from the next line (Takeda et al. 1982, doi:10.1364/JOSA.72.000156). The phase is followed from
+period to period by its derivatives, which never wrap where a distortion bends the lines by less than half a period
+per period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from semcal_ros.core.arrays import Array, Array32, Image, Indices, Mask
+from semcal_ros.core.corners.lattice import Lattice, enlarged
+from semcal_ros.core.corners.saddle import LatticeStatus
+from semcal_ros.core.errors import Rejection
+
+__all__ = ["find_lines", "fit_directions"]
+
+# Side of the part of the picture, at each of its scales, in which the frequency is looked for, px.
+_PART_PX = 1024
+# Periods that are looked for: at least so many in the part, and so many pixels long.
+_LEAST_PERIODS, _LEAST_PERIOD_PX = 3.5, 5.0
+# Power of the lines over the median at frequencies of the same size. The power of noise has an exponential
+# distribution: the largest of half a million values is 19 times the median, and 200 times has a chance of 1e-55.
+_PEAK = 200.0
+# Power at a half or a third of the frequency that makes it the frequency: over the same median, which chance exceeds
+# once in 1e15, and over that of the frequency, whose side lobes behind the window are below.
+_SUBMULTIPLE, _SIDE_LOBE = 50.0, 1e-3
+# Power at any frequency that is no multiple, relative to that of the lines, from which the pattern repeats across them
+# as well: equal crossed lines, dots and squares have 1.
+_ACROSS = 0.1
+# Bins beside the direction of the lines that belong to them: the main lobe of the window has two, and a distortion that
+# bends lines by a tenth of their frequency has as many bins as a tenth of it.
+_LOBE, _BENT = 3.0, 0.1
+# Frequencies of the same size, in octaves either way: at the least number of periods, some 70 are no multiples.
+_RING = 1.0
+# Standard deviation of the low pass behind the demodulation, in periods: harmonics are down to 4e-5.
+_SMOOTH = 0.75
+# Degree of the smooth part of the phase. The rest is added to it.
+_DEGREE = 5
+# Part of the median amplitude below which there are no lines, such as under debris or beyond the end of the grating.
+_FAINT = 0.3
+# Residual phase beyond which lines were not followed, rad: half a period is pi.
+_LOST = 2.0
+# Newton steps from an even lattice to the lines.
+_STEPS = 6
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """The strongest spatial frequency.
+
+    Attributes
+    ----------
+    frequency
+        (2,) cycles per pixel along x and y.
+    power
+        Its power over the median at frequencies of the same size.
+    across
+        The largest power at other frequencies than its multiples, over its own.
+    octave
+        The scale at which it was found.
+    """
+
+    frequency: Array
+    power: float
+    across: float
+    octave: int
+
+    @property
+    def period_px(self) -> float:
+        """The period in pixels of the whole picture."""
+        return float(2.0**self.octave / np.linalg.norm(self.frequency))
+
+
+def find_lines(
+    level: Callable[[int], Array32], size: tuple[int, int]
+) -> Lattice | Rejection[LatticeStatus]:
+    """Find parallel lines, and places along them as far apart as the lines.
+
+    Parameters
+    ----------
+    level
+        The image reduced by powers of two.
+    size
+        (width, height) of the image, px.
+
+    Returns
+    -------
+    A lattice whose ``i`` counts lines and whose ``j`` counts places along them, good to a tenth of the period, or why
+    there is none: no frequency stands out, or lines or points repeat in another direction too.
+    """
+    octaves = range(max(0, int(np.ceil(np.log2(max(size) / _PART_PX)))) + 1)
+    waves = [_find_wave(level(octave), octave) for octave in octaves]
+    found = [wave for wave in waves if wave is not None and wave.power > _PEAK]
+    if not found:
+        return Rejection(
+            LatticeStatus.NO_LATTICE, "no grating: no spatial frequency stands out of the picture"
+        )
+    wave = max(found, key=lambda w: w.power)
+    if wave.across > _ACROSS:
+        return Rejection(
+            LatticeStatus.OTHER_PATTERN,
+            "no grating: what is seen repeats in two directions: set the pattern to auto",
+        )
+    # The coarsest scale that resolves them is as good as any for the phase, and costs least.
+    octave = max(0, int(np.log2(wave.period_px / (1.6 * _LEAST_PERIOD_PX))))
+    lattice = _follow(level(octave), wave.frequency * 2.0 ** (octave - wave.octave))
+    if isinstance(lattice, Rejection):
+        return lattice
+    factor = 2.0**octave
+    return Lattice(lattice.ij, enlarged(lattice.xy, factor), lattice.axes * factor)
+
+
+def fit_directions(ij: Indices, xy: Array) -> Array:
+    """Fit the directions of lines at all places on them, by a polynomial through these.
+
+    The part of a residual along a line is not known, and may be some pixels. Directions from neighbours alone are off
+    by thousandths, which would turn it into hundredths of a pixel across, as if it were known.
+
+    Parameters
+    ----------
+    ij, xy
+        (n, 2) number of the line and of the place, and positions, px.
+
+    Returns
+    -------
+    (n, 2) unit vectors towards growing j.
+    """
+    middle, scale = ij.mean(axis=0), np.maximum(0.5 * np.ptp(ij, axis=0), 1.0)
+    u, v = ((ij - middle) / scale).T
+    # At least twice as many places as terms, and more of them for what a lens alone does not need.
+    most = next(degree for degree, least in ((_DEGREE, 150), (3, 20), (1, 0)) if len(ij) >= least)
+    powers = [(a, n - a) for n in range(most + 1) for a in range(n + 1)]
+    basis = np.stack([u**a * v**b for a, b in powers], axis=1)
+    slope = np.stack([b * u**a * v ** max(b - 1, 0) for a, b in powers], axis=1)
+    along = slope @ np.linalg.lstsq(basis, xy, rcond=None)[0]
+    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
+
+
+def _find_wave(image: Image, octave: int) -> _Wave | None:
+    """Find the strongest frequency in the middle of an image; None where it has no contrast."""
+    height, width = (min(side, _PART_PX) for side in image.shape)
+    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+    part = image[top : top + height, left : left + width].astype(np.float64)
+    window = np.outer(np.hanning(height), np.hanning(width))
+    part = (part - float((part * window).sum() / window.sum())) * window
+    power = np.abs(np.fft.rfft2(part)) ** 2
+    fy, fx = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
+    radius = np.hypot(fx, fy)
+    lowest = _LEAST_PERIODS / min(height, width)
+    allowed = (radius > lowest) & (radius < 1.0 / _LEAST_PERIOD_PX)
+    if not np.any(allowed) or float(power[allowed].max()) <= 0.0:
+        return None
+    row, column = np.unravel_index(np.argmax(np.where(allowed, power, 0.0)), power.shape)
+    frequency = np.array([fx[row, column], fy[row, column]])
+
+    bins = np.hypot(fx * width, fy * height)
+
+    def is_aside(f: Array) -> Mask:
+        """Whether frequencies are no multiples of one, within the lobes of the window and the bend of the lines."""
+        along = (fx * f[0] + fy * f[1]) / float(f @ f)
+        aside = np.hypot((fx - along * f[0]) * width, (fy - along * f[1]) * height)
+        return np.asarray(aside > _LOBE + _BENT * bins)
+
+    def median_near(f: Array) -> float:
+        octaves = np.abs(np.log2(np.maximum(radius, 1e-9) / float(np.linalg.norm(f))))
+        others = power[(octaves < _RING) & is_aside(f)]
+        return max(float(np.median(others)), 1e-300) if len(others) else np.inf
+
+    def strongest_near(f: Array) -> tuple[float, Array]:
+        near = np.hypot((fx - f[0]) * width, (fy - f[1]) * height) < _LOBE
+        own = np.where(near, power, 0.0)
+        total = float(own.sum())
+        return float(own.max()), np.array([(own * fx).sum(), (own * fy).sum()]) / max(total, 1e-300)
+
+    highest = float(power[row, column])
+    for divisor in (3.0, 2.0):
+        lower = frequency / divisor
+        if np.linalg.norm(lower) < lowest:
+            continue
+        peak, centre = strongest_near(lower)
+        if peak > max(_SUBMULTIPLE * median_near(lower), _SIDE_LOBE * highest):
+            frequency = centre
+            break
+    peak, frequency = strongest_near(frequency)
+    others = allowed & is_aside(frequency)
+    across = float(np.max(power[others], initial=0.0)) / highest
+    return _Wave(frequency, peak / median_near(frequency), across, octave)
+
+
+def _follow(image: Array32, frequency: Array) -> Lattice | Rejection[LatticeStatus]:
+    """Return places on the lines of this frequency, by the phase of the image."""
+    height, width = image.shape
+    period = float(1.0 / np.linalg.norm(frequency))
+    amplitude, phase_rate, values = _demodulate(image, frequency, period)
+    smooth = _fit_phase(amplitude, values, period)
+    rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
+    weight = amplitude**2
+    turned = values * np.exp(-1j * smooth(columns, rows))
+    constant = float(np.angle(np.sum(turned * weight)))
+    left = np.angle(turned * np.exp(-1j * constant))
+    seen = amplitude > _FAINT * float(np.median(amplitude))
+    if float(np.mean(np.abs(left[seen]) > _LOST)) > 0.1:
+        return Rejection(
+            LatticeStatus.NO_LATTICE, "no grating: its lines cannot be followed across the picture"
+        )
+
+    def phase(xy: Array) -> Array:
+        x, y = xy.T
+        rest = ndimage.map_coordinates(left, [y, x], order=1, mode="nearest")
+        return phase_rate[0] * x + phase_rate[1] * y + smooth(x, y) + constant + rest
+
+    across = frequency * period**2
+    # Right-handed with x to the right and y down.
+    along = np.array([-across[1], across[0]])
+    middle = 0.5 * np.array([width - 1, height - 1])
+    reach = int(np.ceil(0.5 * np.hypot(width, height) / period)) + 2
+    i, j = (g.ravel() for g in np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"))
+    ij = np.stack([i, j], axis=1).astype(np.intp)
+    xy = middle + i[:, None] * across + j[:, None] * along
+    first = np.round(float(phase(middle[None])[0]) / (2.0 * np.pi))
+    for _ in range(_STEPS):
+        miss = phase(xy) - 2.0 * np.pi * (first + i)
+        xy = xy - np.clip(miss / (2.0 * np.pi), -2.0, 2.0)[:, None] * across
+    inside: Mask = np.all((xy >= 0.0) & (xy <= [width - 1, height - 1]), axis=1)
+    inside &= np.abs(phase(xy) - 2.0 * np.pi * (first + i)) < 0.5
+    at = np.rint(xy[inside]).astype(np.intp)
+    kept = np.flatnonzero(inside)[seen[at[:, 1], at[:, 0]]]
+    axes = np.broadcast_to(np.stack([across, along]), (len(kept), 2, 2)).copy()
+    return Lattice(ij[kept], xy[kept], axes)
+
+
+def _demodulate(image: Array32, frequency: Array, period: float) -> tuple[Array, Array, Array]:
+    """Return the (h, w) amplitude, the (2,) phase per pixel that was taken off, and the (h, w) rest as unit phasors."""
+    height, width = image.shape
+    rate = 2.0 * np.pi * frequency
+    sigma = _SMOOTH * period
+    level = cv2.GaussianBlur(image, (0, 0), sigma)
+    rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
+    wave = np.exp(-1j * (rate[0] * columns + rate[1] * rows))
+    mixed = (image - level) * wave
+    real, imaginary = (
+        cv2.GaussianBlur(np.ascontiguousarray(part, dtype=np.float32), (0, 0), sigma)
+        for part in (mixed.real, mixed.imag)
+    )
+    values = real.astype(np.float64) + 1j * imaginary
+    amplitude = np.abs(values)
+    return amplitude, rate, values / np.maximum(amplitude, 1e-30)
+
+
+def _fit_phase(amplitude: Array, values: Array, period: float) -> Callable[[Array, Array], Array]:
+    """Fit a polynomial without a constant to the phase of phasors, by the differences of neighbours."""
+    height, width = amplitude.shape
+    step = max(1, round(period))
+    scale = 0.5 * max(width, height)
+    middle = 0.5 * np.array([width - 1, height - 1])
+    powers = [(a, n - a) for n in range(1, _DEGREE + 1) for a in range(n + 1)]
+
+    def basis(x: Array, y: Array) -> list[Array]:
+        u, v = (x - middle[0]) / scale, (y - middle[1]) / scale
+        return [u**a * v**b for a, b in powers]
+
+    grid = values[::step, ::step]
+    weight = amplitude[::step, ::step]
+    rows, columns = np.mgrid[0:height:step, 0:width:step].astype(np.float64)
+    terms = np.stack(basis(columns, rows), axis=-1)
+    design, target, weights = [], [], []
+    for axis in (0, 1):
+        first = [slice(None)] * 2
+        second = [slice(None)] * 2
+        first[axis], second[axis] = slice(None, -1), slice(1, None)
+        a, b = tuple(first), tuple(second)
+        target.append(np.angle(grid[b] * np.conj(grid[a])).ravel())
+        weights.append(np.minimum(weight[a], weight[b]).ravel())
+        design.append((terms[b] - terms[a]).reshape(-1, len(powers)))
+    matrix, right, certain = (np.concatenate(parts) for parts in (design, target, weights))
+    normal = matrix.T @ (matrix * certain[:, None])
+    # The ridge is for pictures of few periods, which do not determine all terms.
+    normal += 1e-6 * float(np.trace(normal)) / len(powers) * np.eye(len(powers))
+    coefficients = np.linalg.solve(normal, matrix.T @ (right * certain))
+
+    def smooth(x: Array, y: Array) -> Array:
+        return np.asarray(sum(c * term for c, term in zip(coefficients, basis(x, y), strict=True)))
+
+    return smooth
