@@ -117,7 +117,8 @@ def find_lines(
         return Rejection(
             LatticeStatus.NO_LATTICE, "no grating: no spatial frequency stands out of the picture"
         )
-    wave = max(found, key=lambda w: w.power)
+    # The finest scale sees most of what lies across the lines.
+    wave = found[0]
     if wave.across > _ACROSS:
         return Rejection(
             LatticeStatus.OTHER_PATTERN,
@@ -204,7 +205,7 @@ def _find_wave(image: Image, octave: int) -> _Wave | None:
             frequency = centre
             break
     peak, frequency = strongest_near(frequency)
-    others = allowed & is_aside(frequency)
+    others = (radius > lowest) & is_aside(frequency)
     across = float(np.max(power[others], initial=0.0)) / highest
     return _Wave(frequency, peak / median_near(frequency), across, octave)
 

@@ -203,6 +203,11 @@ class DriftUpdate(DriftEstimate):
     doubt
         (2, 2) the part of the covariance that is due to images that contradict the prediction, this one or
         those before; zero where the drift rests on the frame's own image.
+    along
+        (2,) direction of the lines that the frame shows, px: the drift along them is only predicted; None where both
+        directions are measured.
+    unseen
+        (2, 2) the part of the covariance that is due to that prediction; zero where both directions are measured.
     moving
         What does not move with the specimen, in px of the rectified frame before its drift is removed; None where
         nothing was found.
@@ -223,6 +228,8 @@ class DriftUpdate(DriftEstimate):
     keyframe_time_s: float
     merged: bool
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
+    along: Array | None = field(default=None, kw_only=True)
+    unseen: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     moving: MovingTiles | None = field(default=None, kw_only=True)
     of_scale: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 
@@ -238,7 +245,9 @@ class DriftUpdate(DriftEstimate):
 
     @property
     def status_text(self) -> str:
-        """``"keyframe"``, ``"tracked"`` or ``"coasting: <reason>"``."""
+        """``"keyframe"``, ``"tracked"``, the same with what was not seen, or ``"coasting: <reason>"``."""
+        if self.along is not None and not self.reason:
+            return f"{self.status.value} across lines; predicted along them"
         return f"{self.status.value}: {self.reason}" if self.reason else self.status.value
 
     @property
@@ -281,7 +290,7 @@ class DriftPredictor:
     similarity
         Predictor of rotation and scale, or None where there are none.
     doubt
-        (2, 2) by how much the drift may be off because the last frames contradict it.
+        (2, 2) by how much the drift may be off because the last frames contradict it, or do not show a direction.
     measured
         Whether any drift was measured; if not, a prediction has an infinite covariance.
     """

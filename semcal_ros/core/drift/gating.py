@@ -30,6 +30,7 @@ __all__ = [
     "OutlierTest",
     "inflate_after_pause",
     "inflate_if_contradicted",
+    "inflate_position",
     "inflate_when_lost",
     "judge_shift",
 ]
@@ -193,6 +194,11 @@ def inflate_after_pause(speed: float, pause_s: float) -> Inflate:
     """After a long time without a frame: the drift may have stopped, or doubled its speed."""
     spread = np.eye(2) * (speed * pause_s) ** 2
     return _inflate(spread, spread / pause_s**2)
+
+
+def inflate_position(covariance: Array) -> Inflate:
+    """Where the drift was only predicted in a direction that was not seen: ``covariance`` (2, 2) of that."""
+    return _inflate(covariance, np.zeros((2, 2)))
 
 
 def inflate_when_lost(px_from_unit: Array, reach_px: float, speed_px_s: float) -> Inflate:

@@ -82,6 +82,7 @@ class DriftHistory:
             for k, (update, state, turn) in enumerate(zip(stretch, states, turns, strict=True)):
                 camera = self._cameras[len(updates)]
                 smoothed = _smoothed(update, state, turn, camera)
+                smoothed.covariance[:2, :2] += update.unseen
                 if not resolved[k]:
                     smoothed.covariance[:2, :2] += update.doubt
                 if update.time_s > first_s:

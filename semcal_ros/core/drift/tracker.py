@@ -52,6 +52,7 @@ from semcal_ros.core.drift.gating import (
     OutlierTest,
     inflate_after_pause,
     inflate_if_contradicted,
+    inflate_position,
     inflate_when_lost,
     judge_shift,
 )
@@ -126,7 +127,9 @@ class _Track:
     ``rejected`` is the number of frames in a row that did not match. ``doubt`` (2, 2) is what the last
     frames that contradict the prediction add to the covariance of the drift, until one matches. ``apart`` says whether
     something in the last frame that matched did not move with the specimen. ``before`` is the last frame as it came,
-    and ``overlay`` what is drawn into all of them, of which there were ``seen``.
+    and ``overlay`` what is drawn into all of them, of which there were ``seen``. Where the specimen shows lines only,
+    ``along`` (2,) is their direction in px, ``unseen`` what was known before the first frame that did not tell the
+    drift along them, and ``of_unseen`` (2, 2) what that adds to the covariance of the last frame.
     """
 
     filter: DriftFilter
@@ -141,10 +144,23 @@ class _Track:
     before: AnyImage | None = None
     overlay: Mask | None = None
     seen: int = 0
+    along: Array | None = None
+    unseen: DriftState | None = None
+    of_unseen: Array = field(default_factory=lambda: np.zeros((2, 2)))
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
     similarity: SimilarityTracker = field(
         default_factory=lambda: SimilarityTracker(keeps_history=False)
     )
+
+    def unseen_covariance(self, px_from_unit: Array) -> Array:
+        """(2, 2) covariance of the drift along lines, which has only been predicted since they alone are seen."""
+        if self.unseen is None or self.along is None:
+            return np.zeros((2, 2))
+        coasting = DriftPredictor(self.unseen, self.filter.process_noise, None)
+        covariance = coasting.at(self.filter.state.time_s).covariance[:2, :2]
+        direction = np.linalg.solve(px_from_unit, self.along)
+        variance = float(self.along @ px_from_unit @ covariance @ px_from_unit.T @ self.along)
+        return variance * np.outer(direction, direction)
 
     def forget(self, key: int) -> None:
         """Remove a keyframe from what is estimated."""
@@ -241,7 +257,7 @@ class DriftTracker:
             track.filter.process_noise,
             track.camera,
             similarity,
-            doubt=track.doubt,
+            doubt=track.doubt + track.of_unseen,
             measured=track.filter.measured > 0,
         )
 
@@ -299,6 +315,7 @@ class DriftTracker:
         track.filter.mark_frame()
         track.similarity.mark_frame(track.filter.state.time_s)
         track.camera, track.time_s = fitted, centre_s
+        track.of_unseen = track.unseen_covariance(frame.px_from_unit)
         if self._history is not None:
             self._history.add(update, fitted)
         return update
@@ -522,6 +539,7 @@ class DriftTracker:
         appears = track.similarity.keyframe_similarity(key)
         if is_turned:
             px_from_unit = similarity_matrix(appears) @ px_from_unit
+        covariance = covariance + track.unseen_covariance(px_from_unit)
         registration = register(
             reference,
             image,
@@ -571,7 +589,13 @@ class DriftTracker:
 
     def _use(self, track: _Track, frame: ScanFrame, match: _Match) -> _RejectedMatch | None:
         """Update the filter by a match, unless it contradicts the prediction."""
-        drift_filter, state, measure = track.filter, track.filter.state, match.measure
+        drift_filter, measure = track.filter, match.measure
+        along = match.registration.along
+        unseen = track.unseen_covariance(frame.px_from_unit)
+        if along is None and np.any(unseen):
+            # What is seen again may be anywhere along the lines.
+            drift_filter.apply(inflate_position(unseen))
+        state = drift_filter.state
         expected, _ = state.predict_shift(measure.key)
         innovation = measure.shift[:2] - expected
         keyframe = track.store[measure.key]
@@ -597,6 +621,11 @@ class DriftTracker:
             return _RejectedMatch(judged, match.registration, disputed)
         if judged is not None:
             drift_filter.apply(judged)
+        if along is not None and track.unseen is None:
+            track.unseen = state.without_keyframes()
+        track.along = along
+        if along is None:
+            track.unseen = None
         since_s = state.time_s - track.time_s
         track.similarity.use(match.similarity, since_s)
         if outcome.shear_nis > GATE:
@@ -817,7 +846,8 @@ def _make_update(
     covariance = covariance + of_scale
     if not is_first:
         covariance[:2, :2] += track.filter.process_noise.flicker_covariance
-    covariance[:2, :2] += track.doubt
+    unseen = track.unseen_covariance(frame.px_from_unit)
+    covariance[:2, :2] += track.doubt + unseen
     if track.filter.measured == 0:
         covariance = forget_prior(covariance, is_first=is_first)
     alignment = None if registration is None else registration.alignment
@@ -843,6 +873,8 @@ def _make_update(
         similarity=similarity.mean,
         similarity_covariance=similarity.covariance,
         doubt=track.doubt,
+        unseen=unseen,
+        along=None if registration is None else registration.along,
         moving=None if registration is None else registration.moving,
         of_scale=of_scale[:2, :2],
     )

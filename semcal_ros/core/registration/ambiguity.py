@@ -35,7 +35,7 @@ from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["choose_peak"]
+__all__ = ["choose_peak", "compare_residuals"]
 
 
 # Part of the residual by which two shifts must differ to be told apart: below it, the error of the
@@ -106,7 +106,7 @@ def choose_peak(
         shift, other = best[1].shift_px, alignment.shift_px
         if float(np.max(np.abs(other - shift))) < _SAME_SHIFT_PX:
             continue
-        deviations = _compare_residuals(best[2], energies)
+        deviations = compare_residuals(best[2], energies)
         if abs(deviations) < limits.min_deviations:
             return Rejection(
                 MatchFailure.AMBIGUOUS,
@@ -142,7 +142,7 @@ def _prefer_prediction(
         else tile_residual_energies(reference.levels[-1], pyramid, alignment.shift_px)
         for alignment in alignments
     ]
-    deviations = _compare_residuals(energies[0], energies[1], _MIN_CONTRADICTION)
+    deviations = compare_residuals(energies[0], energies[1], _MIN_CONTRADICTION)
     if deviations < -reference.settings.min_deviations:
         x, y = highest.shift_px
         return Rejection(
@@ -159,11 +159,13 @@ def _is_predicted(peak: CoarsePeak, guess: Array, guess_covariance: Array) -> bo
     return float(innovation @ np.linalg.solve(covariance, innovation)) <= _PREDICTED_CHI2
 
 
-def _compare_residuals(
+def compare_residuals(
     first: Array | None, second: Array | None, least: float = _MIN_RESIDUAL_DIFFERENCE
 ) -> float:
-    """By how many standard errors the second shift explains the common tiles worse than the first;
-    0 where the difference is less than the part ``least`` of the residual.
+    """By how many standard errors the second shift explains the common tiles worse than the first.
+
+    0 where the difference is less than the part ``least`` of the residual. ``first`` and ``second`` are those of
+    :func:`~semcal_ros.core.registration.inverse_compositional.tile_residual_energies`.
     """
     if second is None:
         return np.inf

@@ -352,7 +352,11 @@ class _Comparison:
 
 
 def align(
-    levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array
+    levels: Sequence[PyramidLevel],
+    image: Pyramid,
+    start_px: Array,
+    *,
+    held: Array | None = None,
 ) -> Alignment | Rejection[MatchFailure]:
     """Refine a shift.
 
@@ -364,21 +368,28 @@ def align(
         The image.
     start_px
         (2,) shift in full-resolution px, right to about a pixel of the first level.
+    held
+        (2,) unit vector along which the shift stays as it is; of the covariance and the halves only what lies across it
+        means anything then.
 
     Returns
     -------
     The alignment, which may not have converged; or a rejection where too little overlaps, the gradient
     leaves a direction undetermined, or the images have no structure in common.
     """
-    found = _align(levels, image, start_px, HESSIAN_PIXELS)
+    found = _align(levels, image, start_px, HESSIAN_PIXELS, held)
     if isinstance(found, Rejection) and found.status is not MatchFailure.TOO_LITTLE_OVERLAP:
         # What the gradients of some pixels do not tell from chance, those of all may.
-        return _align(levels, image, start_px, ALL_PIXELS)
+        return _align(levels, image, start_px, ALL_PIXELS, held)
     return found
 
 
 def _align(
-    levels: Sequence[PyramidLevel], image: Pyramid, start_px: Array, enough: int
+    levels: Sequence[PyramidLevel],
+    image: Pyramid,
+    start_px: Array,
+    enough: int,
+    held: Array | None,
 ) -> Alignment | Rejection[MatchFailure]:
     """Refine a shift with the common gradient of enough pixels."""
     shift = np.asarray(start_px, dtype=np.float64)
@@ -386,7 +397,7 @@ def _align(
     for level in levels[:-1]:
         hessian = None
         for _ in range(_MAX_COARSE_PASSES):
-            comparison = _compare(level, image, shift / level.factor, hessian, enough)
+            comparison = _compare(level, image, shift / level.factor, hessian, enough, held=held)
             if isinstance(comparison, Rejection):
                 # A fine texture may be lost at this resolution; the next one knows more.
                 break
@@ -396,7 +407,9 @@ def _align(
                 break
     hessian = None
     for _ in range(_MAX_PASSES):
-        comparison = _compare(levels[-1], image, shift / levels[-1].factor, hessian, enough)
+        comparison = _compare(
+            levels[-1], image, shift / levels[-1].factor, hessian, enough, held=held
+        )
         if isinstance(comparison, Rejection):
             return comparison
         passes += 1
@@ -486,10 +499,11 @@ def _compare(
     enough: int = HESSIAN_PIXELS,
     weights: Array | None = None,
     noise: float = 0.0,
+    held: Array | None = None,
 ) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
     comparison, None to compute it from enough pixels. ``weights`` (rows, cols) are those of the reference's tiles, and
-    ``noise`` the variance of its smoothed pixels.
+    ``noise`` the variance of its smoothed pixels. ``held`` is as for :func:`align`.
     """
     pixels = image.centred(level.factor)
     size = pixels.shape[1], pixels.shape[0]
@@ -505,7 +519,7 @@ def _compare(
     plain = sums
     if weights is not None:
         sums = sums.weighted(weights)
-    fit = solve_step(geometry, sums)
+    fit = solve_step(geometry, sums, held)
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
         return _find_chance_gradient(level, geometry, information, enough) or Rejection(
@@ -766,14 +780,16 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     return SimilarityFit(matrix @ step, matrix @ covariance @ matrix.T)
 
 
-def tile_residual_energies(level: PyramidLevel, image: Pyramid, shift_px: Array) -> Array | None:
+def tile_residual_energies(
+    level: PyramidLevel, image: Pyramid, shift_px: Array, held: Array | None = None
+) -> Array | None:
     """(rows, cols) mean squared residual of each tile of the reference at a shift; NaN where they
     do not overlap with the image.
 
     For comparing competing shifts of the same two images: a paired test over tiles tells whether one
-    explains the image better than chance and model error allow.
+    explains the image better than chance and model error allow. ``held`` is as for :func:`align`, for images of lines.
     """
-    comparison = _compare(level, image, shift_px / level.factor, None)
+    comparison = _compare(level, image, shift_px / level.factor, None, held=held)
     if isinstance(comparison, Rejection):
         return None
     energies = np.full(level.normal_matrices.shape[:2], np.nan)

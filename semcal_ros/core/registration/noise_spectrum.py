@@ -41,6 +41,7 @@ __all__ = [
     "gaussian_taps",
     "measure_image",
     "measure_richest_parts",
+    "passed_gradient",
     "passed_variance",
     "shared_pixels",
     "smooth",
@@ -59,6 +60,8 @@ _BINS = 48
 _SIGMAS_PX = np.concatenate([[0.0], np.geomspace(0.4, 3.2, 19)])
 # The noise is what is found beyond this part of the Nyquist frequency, in the corners.
 _NOISE_BAND = 0.9
+# Frequencies of the spectrum of a smoothing, more than it has taps.
+_FREQUENCIES = 256
 # A ring holds signal where it exceeds the noise by this many standard errors.
 _SIGNAL_SIGMAS = 2.0
 # The Gaussian is cut off where it has 0.2 % of its height.
@@ -229,6 +232,13 @@ def gaussian_taps(sigma_px: float) -> Array:
 def passed_variance(sigma_px: float) -> float:
     """What :func:`smooth` leaves of a variance of white noise of one."""
     return float(np.sum(gaussian_taps(sigma_px) ** 2)) ** 2
+
+
+def passed_gradient(sigma_px: float) -> float:
+    """Variance, per px^2, of the gradient along each axis of white noise of variance one after :func:`smooth`."""
+    frequency = 2.0 * np.pi * np.fft.fftfreq(_FREQUENCIES)
+    power = np.abs(np.fft.fft(gaussian_taps(sigma_px), _FREQUENCIES)) ** 2
+    return float(np.mean(frequency**2 * power) * np.mean(power))
 
 
 def shared_pixels(sigma_px: float) -> float:

@@ -21,6 +21,7 @@ from functools import cached_property
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
+from semcal_ros.core.registration.one_direction import OneDirection, find_direction
 from semcal_ros.core.registration.periodicity import find_periods
 from semcal_ros.core.registration.tiles import PyramidLevel
 
@@ -93,6 +94,13 @@ class Reference:
     defect: str
     settings: RegistrationSettings = field(default_factory=RegistrationSettings)
     is_sparse: bool = False
+
+    @cached_property
+    def lines(self) -> OneDirection | None:
+        """The direction of its lines, if it shows nothing else; looked for when first asked."""
+        if not self.levels:
+            return None
+        return find_direction(self.levels, self.coarse.pyramid, self.noise_variance)
 
     @cached_property
     def periods(self) -> Array:

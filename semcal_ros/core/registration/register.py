@@ -22,7 +22,9 @@ most of their structure in common, and no competing shift explains the image as 
 Where not all of the image moves by one shift, the specimen is what moves as predicted, or nearly all of the structure
 (:mod:`.specimen`); the rest is left out. A periodic specimen is registered by its defects (:mod:`.periodicity`).
 
-It fails, and says so, on images without structure in some direction, on fine lattices without defects, where two
+Of lines in one direction only the shift across them is measured (:mod:`.one_direction`).
+
+It fails, and says so, on images without structure, on fine lattices without defects, where two
 parts move differently and nothing says which is the specimen, and on images whose scales differ by more than about 1 %.
 """
 
@@ -37,12 +39,13 @@ from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.acceptance import find_failure
 from semcal_ros.core.registration.agreement import MovingTiles
-from semcal_ros.core.registration.ambiguity import choose_peak
+from semcal_ros.core.registration.ambiguity import choose_peak, compare_residuals
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
     SimilarityFit,
     align,
+    tile_residual_energies,
     unmeasured_alignment,
 )
 from semcal_ros.core.registration.mismatch import explain_deformation, explain_mismatch
@@ -57,6 +60,7 @@ from semcal_ros.core.registration.normalised_correlation import (
     CoarseReference,
     find_coarse_peaks,
 )
+from semcal_ros.core.registration.one_direction import OneDirection, align_across
 from semcal_ros.core.registration.periodicity import choose_period
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.specimen import keep_specimen, look_at_whole
@@ -92,6 +96,8 @@ _MIN_SIGNAL_OF_PARTS = 0.3
 _MIN_SIGNAL_SHARE = 0.02
 
 
+# Where an image that shows more than lines fits worse: beyond the width of any detail.
+_FARTHER_PX = 8.0
 # Less than this of the structure agrees where images are of two motions, though no part was found to be one.
 _MUCH_AGREES = 0.85
 
@@ -128,6 +134,9 @@ class Registration:
         What does not move with the specimen and was left out; None where all does.
     share
         Part of the structure that agrees with the shift.
+    along
+        (2,) the direction of lines along which the shift is the predicted one, since they do not tell it, and its
+        covariance means nothing; None where both directions are measured.
     """
 
     alignment: Alignment
@@ -136,6 +145,7 @@ class Registration:
     nearest_px: Array = field(default_factory=lambda: np.full(2, np.nan))
     moving: MovingTiles | None = None
     share: float = 1.0
+    along: Array | None = None
 
     _middle_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
     _origin_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
@@ -376,6 +386,100 @@ def register(
     InvalidValueError
         If the shape or type is not that of an image, or the region does not lie in it.
     """
+    found = _register(
+        reference,
+        image,
+        guess_px=guess_px,
+        guess_covariance=guess_covariance,
+        image_region=image_region,
+        max_shear_px=max_shear_px,
+        apart=apart,
+    )
+    if reference.defect or guess_covariance is None or reference.lines is None:
+        return found
+    if found.accepted and _is_seen_along(reference, reference.lines, image, image_region, found):
+        return found
+    across = _register_across(
+        reference, reference.lines, image, guess_px, guess_covariance, image_region
+    )
+    return across if across.accepted else found
+
+
+def _is_seen_along(
+    reference: Reference,
+    lines: OneDirection,
+    image: ArrayLike,
+    image_region: Region | None,
+    found: Registration,
+) -> bool:
+    """Whether an image tells a shift along lines: whether it fits clearly worse farther on either way."""
+    gray, inside = _crop(image, image_region)
+    level, pyramid = reference.levels[-1], Pyramid(gray)
+    origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)
+    shift = found.shift_px - origin
+    here = tile_residual_energies(level, pyramid, shift, lines.along)
+    farther = [
+        tile_residual_energies(level, pyramid, shift + length * lines.along, lines.along)
+        for length in (-_FARTHER_PX, _FARTHER_PX)
+    ]
+    least = reference.settings.min_deviations
+    return all(compare_residuals(here, there) > least for there in farther)
+
+
+def _register_across(
+    reference: Reference,
+    lines: OneDirection,
+    image: ArrayLike,
+    guess_px: ArrayLike,
+    guess_covariance: ArrayLike,
+    image_region: Region | None,
+) -> Registration:
+    """Measure the shift across the lines of a reference that shows nothing else, at the predicted place along them."""
+    gray, inside = _crop(image, image_region)
+    defect = _find_defect(gray, reference.settings)
+    if defect:
+        return _reject(MatchFailure.UNUSABLE_IMAGE, f"image: {defect}")
+    origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)
+    limits, pyramid = reference.settings, Pyramid(gray)
+    guess = np.asarray(guess_px, dtype=np.float64) - origin
+    found = align_across(
+        reference.coarse,
+        reference.levels,
+        pyramid,
+        lines,
+        guess,
+        np.asarray(guess_covariance, dtype=np.float64),
+        limits.min_competing_height,
+    )
+    if isinstance(found, Rejection):
+        return Registration(unmeasured_alignment(), float("nan"), found)
+    peak, alignment = found
+    image_noise = estimate_noise_variance(_texture(gray, inside, limits))
+    whole = look_at_whole(reference, alignment, image_noise)
+    correlation = _correct_correlation(reference, image_noise, alignment)
+    # Only the direction across is judged.
+    sigma2 = float(lines.across @ alignment.covariance @ lines.across)
+    rejection = find_failure(
+        limits, peak, replace(alignment, covariance=sigma2 * np.eye(2)), correlation, 0.0
+    )
+    if rejection is None and whole is not None and whole.share < _MUCH_AGREES:
+        reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
+        rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
+    moved = replace(alignment, shift_px=alignment.shift_px + origin)
+    return Registration(moved, correlation, rejection, along=lines.along)
+
+
+def _register(
+    reference: Reference,
+    image: ArrayLike,
+    *,
+    guess_px: ArrayLike,
+    guess_covariance: ArrayLike | None,
+    image_region: Region | None,
+    max_shear_px: float,
+    apart: bool,
+) -> Registration:
+    """Measure a shift in both directions."""
     gray, inside = _crop(image, image_region)
     if reference.defect:
         return _reject(MatchFailure.UNUSABLE_REFERENCE, f"reference: {reference.defect}")

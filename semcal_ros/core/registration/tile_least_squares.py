@@ -45,6 +45,8 @@ _MIN_GRADIENT_ENERGY = 0.5
 # Sums of single-precision pixels are good to 1e-7 and no better: what is below is rounding.
 _RCOND = 1e-9
 _MIN_DETERMINANT = 1e-6
+# Information along a direction that is held, relative to that of the gradients: a step there is a hundredth.
+_HELD = 100.0
 # Numbers of tiles for which the ramps are kept: those of a few windows at each resolution.
 _MAX_SHAPES = 32
 
@@ -198,13 +200,17 @@ def invert_symmetric(matrix: Array) -> Array:
     return np.array([[c, -b], [-b, a]]) / (a * c - b * b)
 
 
-def solve_step(geometry: TileGeometry, sums: TileSums) -> TileFit | None:
+def solve_step(geometry: TileGeometry, sums: TileSums, held: Array | None = None) -> TileFit | None:
     """Gain, offset and step, or None where the gradient leaves a direction undetermined.
+
+    There is no step along the unit vector ``held`` (2,).
 
     Noise makes the reference's gradient evaluation steeper than it is; the common information does not
     contain it.
     """
     information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
+    if held is not None:
+        information = information + _HELD * np.trace(information) * np.outer(held, held)
     if not well_posed(information):
         return None
     ramps, count = geometry.ramps, geometry.ramps.shape[1]
