@@ -281,6 +281,9 @@ class _ScanKeys:
     recursive_averages: Annotated[int, Field(strict=True, ge=1, le=1_000_000), _Whole] = Field(
         default=1, description="N of a recursive average of passes, 1 to 1000000"
     )
+    bidirectional: Annotated[bool, Field(strict=True)] = Field(
+        default=False, description="true where every other line is scanned backwards, or false"
+    )
 
 
 def _read_scan_timing(value: Any) -> ScanTiming:
@@ -293,6 +296,7 @@ def _read_scan_timing(value: Any) -> ScanTiming:
         keys.flyback_fraction,
         keys.line_averages,
         keys.recursive_averages,
+        keys.bidirectional,
     )
 
 

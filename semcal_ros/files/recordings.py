@@ -39,6 +39,7 @@ from semcal_ros.core.arrays import Mask, check_range
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.start import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
+from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.conditions import find_conditions
 from semcal_ros.files.bags.errors import reading
@@ -340,11 +341,14 @@ class Recording(ABC):
         self._rejected.clear()
         self._pass_notes.clear()
         count = 0
+        lines = self._line_phase()
         for frame in self._frames():
-            cut = self._cut(frame)
+            cut = self._cut(replace(frame, image=lines.correct(frame.image)))
             if cut is not None:
                 count += 1
                 yield cut
+        if lines.note:
+            self._pass_notes.append(lines.note)
         self._end_pass(count)
 
     def frames_from(self, start: int) -> Iterator[tuple[int, RecordedFrame]]:
@@ -353,10 +357,15 @@ class Recording(ABC):
         What comes before is skipped without being decoded, as far as the files allow. Nothing is noted, and a
         recording may end before.
         """
+        lines = self._line_phase()
         for number, frame in self._frames_from(start):
-            cut = self._cut(frame)
+            cut = self._cut(replace(frame, image=lines.correct(frame.image)))
             if cut is not None:
                 yield number, cut
+
+    def _line_phase(self) -> LinePhaseCorrector:
+        scan = self.config.scan
+        return LinePhaseCorrector(scan is not None and scan.bidirectional)
 
     def _cut(self, frame: RecordedFrame) -> RecordedFrame | None:
         """The frame with its mask, and the part of it that is used; None if it is too small for that."""

@@ -59,6 +59,8 @@ class ScanTiming:
         Number of times that each line is scanned before the next one; all of them are part of the frame time.
     recursive_averages
         N of a recursive average of passes; 1 for none. The stamp is that of the latest pass.
+    bidirectional
+        Whether odd lines, 0 being even, are scanned backwards.
     """
 
     frame_time_s: float
@@ -66,6 +68,7 @@ class ScanTiming:
     flyback_fraction: float = 0.0
     line_averages: int = 1
     recursive_averages: int = 1
+    bidirectional: bool = False
 
     def __post_init__(self) -> None:
         check_positive(self.frame_time_s, "frame time", "s")
@@ -130,7 +133,11 @@ class ScanTiming:
         """
         line_s = self.frame_time_s / rows
         passes_s = 0.5 * (self.averages - 1) * self.frame_time_s - self._lag_s
-        within_line = np.asarray(col, dtype=np.float64) / cols * (1.0 - self.flyback_fraction)
+        within_line = np.asarray(col, dtype=np.float64) / cols
+        if self.bidirectional:
+            is_odd = np.rint(np.asarray(row, dtype=np.float64)) % 2.0 == 1.0
+            within_line = np.where(is_odd, 1.0 - within_line, within_line)
+        within_line = within_line * (1.0 - self.flyback_fraction)
         if self.line_averages > 1:
             within_line = (within_line + 0.5 * (self.line_averages - 1)) / self.line_averages
         return passes_s + line_s * (np.asarray(row, dtype=np.float64) + within_line)

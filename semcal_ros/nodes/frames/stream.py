@@ -35,6 +35,7 @@ from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
@@ -194,6 +195,12 @@ class FrameInput:
             source="image",
             streams=True,
         )
+        # Images that are derived from the microscope's are free of it.
+        self._lines: LinePhaseCorrector | None = None
+        if topic is None:
+            scan = config.scan
+            self._lines = LinePhaseCorrector(scan is not None and scan.bidirectional)
+        self._undeclared = ""
         self._skips_late = self._images.depth <= image_input().depth
         self._transport = ""
         self._image_bytes = 0
@@ -270,7 +277,25 @@ class FrameInput:
         self._reporter.note("magnification", "unknown" if g is None else g)
         self._reporter.note("frames_mixed", self._mixed)
         self._look_for_light(image)
+        image = self._without_line_phase(image)
         return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
+
+    def _without_line_phase(self, image: AnyImage) -> AnyImage:
+        """Move the lines of a bidirectional scan to where they belong; warn of one that nobody declared."""
+        lines = self._lines
+        if lines is None:
+            return image
+        image = lines.correct(image)
+        if lines.declared:
+            self._reporter.note("line_phase_px", lines.phase.shift_px)
+            self._reporter.note("line_phase_sigma_px", lines.phase.sigma_px)
+            return image
+        if not lines.note:
+            self._undeclared = ""
+        elif not self._undeclared:
+            self._undeclared = lines.note
+            self._reporter.warn(self._undeclared)
+        return image
 
     def _look_for_light(self, image: AnyImage) -> None:
         """Check now and then whether there is any picture: a blanked beam still gives frames."""
@@ -305,8 +330,8 @@ class FrameInput:
         return bool(self._images.rivals or self._magnification.rivals)
 
     def conditions(self) -> list[str]:
-        """Return, in a few words, whether the images are too large for the transport, or show nothing."""
-        return [text for text in (self._transport, self._dark) if text]
+        """Return, in a few words, whether images are too large for the transport, dark, or of shifted lines."""
+        return [text for text in (self._transport, self._dark, self._undeclared) if text]
 
 
 class StreamNode(SemNode):

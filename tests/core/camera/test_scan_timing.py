@@ -45,6 +45,13 @@ def test_a_line_that_is_scanned_several_times_is_seen_at_the_mean_of_its_scans()
     assert timing.pixel_offset_s(7, 40, 8, 40) + 0.025 + 0.005 == pytest.approx(0.6)
 
 
+def test_odd_lines_of_a_bidirectional_scan_begin_at_the_other_end() -> None:
+    timing = ScanTiming(0.8, bidirectional=True)
+    # Lines of 0.1 s: a tenth of the way along an even one, and nine tenths along an odd one.
+    assert timing.pixel_offset_s(2, 4, 8, 40) == pytest.approx(0.21)
+    assert timing.pixel_offset_s(3, 4, 8, 40) == pytest.approx(0.39)
+
+
 def test_a_recursive_average_is_as_old_as_its_weights_say() -> None:
     timing = ScanTiming(0.5, 1, 0.1, recursive_averages=4)
     weights = np.zeros(400)

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,9 @@ import tifffile
 from PIL import Image
 
 from semcal_ros.config.config import load_config
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError
+from semcal_ros.core.rectification.line_phase import estimate_line_phase
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, open_recording
 from semcal_ros.files.video import open_video
 from tests.files.tiff.test_to_bag import write_tescan
@@ -257,3 +260,27 @@ def test_an_image_that_is_damaged_is_left_out(tmp_path: Path) -> None:
         frames = list(recording.frames())
         assert [f.image.tolist() for f in frames] == FRAMES[:2].tolist()
         assert len(recording.rejected) == 2
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_lines_of_a_bidirectional_scan_are_moved_back_where_declared(
+    tmp_path: Path, declared: bool
+) -> None:
+    x = np.arange(128.0)
+    rng = np.random.default_rng(3)
+    clean = cv2.GaussianBlur(rng.normal(size=(64, 128)), (0, 0), 2.0)
+    clean = 120.0 + 30.0 * clean / clean.std()
+    both = clean.copy()
+    both[1::2] = [np.interp(x - 2.0, x, line) for line in clean[1::2]]
+    noisy = [np.clip(both + rng.normal(0, 3, both.shape), 0, 255) for _ in range(3)]
+    path = tmp_path / "lines.tif"
+    tifffile.imwrite(path, np.array(noisy).astype(np.uint8), photometric="minisblack")
+    config = replace(CONFIG, scan=ScanTiming(1.0, bidirectional=declared))
+    with open_recording(RecordedFiles(path, 43.9e-9), config) as recording:
+        frames = list(recording.frames())
+        (note,) = [text for text in recording.notes if "odd lines" in text]
+        (_, later) = next(recording.frames_from(2))
+    assert ("moved back" in note) is declared
+    assert np.array_equal(later.image, noisy[2].astype(np.uint8)) is not declared
+    left = estimate_line_phase(frames[-1].image)
+    assert abs(left.shift_px - (0.0 if declared else 2.0)) < 0.1

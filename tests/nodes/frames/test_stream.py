@@ -17,14 +17,18 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from semcal_ros.config.config import load_config
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.rectification.line_phase import estimate_line_phase
 from semcal_ros.nodes.frames.stream import (
     FrameInput,
     StreamFrame,
@@ -62,13 +66,14 @@ def test_late_is_more_than_40_ms_and_more_than_one_and_a_half_intervals(
 class Bench:
     """A frame input, and the frames that it hands on."""
 
-    def __init__(self, depth: float = 10) -> None:
+    def __init__(self, depth: float = 10, *, bidirectional: bool = False) -> None:
         self.endpoints: Any = FakeEndpoints(depth)
         parameters: Any = FakeParameters({"mixed_frames": "drop"})
         self.reporter, self.log = fake_reporter()
         self.frames: list[StreamFrame] = []
+        config = load_config("virtual_sem")
         self.input = FrameInput(
-            load_config("virtual_sem"),
+            replace(config, scan=ScanTiming(0.1, bidirectional=bidirectional)),
             parameters,
             self.endpoints,
             self.reporter,
@@ -235,3 +240,25 @@ def test_images_before_their_magnification_are_counted_and_told_once_it_has_come
         assert StreamNode.known_magnification(node, frame) == g
     assert log == ["images not used because their magnification was not known: 2"]
     assert notes(reporter)["frames_without_magnification"] == "3"
+
+
+def shifted_lines() -> np.ndarray:
+    """Texture whose odd lines are two pixels to the right of where they belong."""
+    texture = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(96, 128)), (0, 0), 2.0)
+    picture = np.clip(120.0 + 150.0 * texture, 0, 255)
+    picture[1::2, 2:] = picture[1::2, :-2]
+    return picture.astype(np.uint8)
+
+
+def test_the_lines_of_a_bidirectional_scan_are_moved_back() -> None:
+    bench = Bench(bidirectional=True)
+    bench.receive(1.0, image=shifted_lines())
+    assert abs(estimate_line_phase(bench.frames[0].image).shift_px) < 0.1
+    assert float(notes(bench.reporter)["line_phase_px"]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_line_phase_that_nobody_declared_is_said_once_and_left() -> None:
+    bench = Bench()
+    bench.receive(1.0, 1.1, 1.2, image=shifted_lines())
+    assert np.array_equal(bench.frames[0].image, shifted_lines())
+    assert [text for text in bench.log if "odd lines" in text] == bench.input.conditions()

@@ -1,0 +1,214 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The line phase of a bidirectional scan: odd lines are shifted against even ones.
+
+Lines that are scanned to the right and back to the left in turn lag behind the beam in opposite directions. A frame is
+freed of that before anything else sees it: even and odd lines move by half of the phase each, towards each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy import fft
+
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array32
+
+__all__ = ["LinePhase", "LinePhaseCorrector", "estimate_line_phase", "remove_line_phase"]
+
+# Largest phase that is looked for, part of the width: lags are some microseconds, and lines take a millisecond.
+_LARGEST = 1.0 / 16.0
+# Lines that are compared with their neighbours at most: they tell the phase of gold at 30 electrons to 0.02 px.
+_MOST_LINES = 128
+# 1-sigma of the smoothing along the lines, px: noise of single pixels tells nothing.
+_SMOOTH_PX = 1.0
+# Gauss-Newton steps at most, and the part of the sigma that may be left.
+_STEPS, _ENOUGH = 6, 0.1
+# Groups of lines from whose scatter the sigma is told, to a sixth.
+_GROUPS = 16
+# A phase is there where it is more than this many sigmas, which chance makes once in a million looks, and this many px.
+_SIGMAS, _LEAST_PX = 5.0, 0.1
+# Lobes of the Lanczos filter that moves lines, to each side.
+_LOBES = 4
+# Weight of the estimates before, against that of the next one: some eight of them count.
+_MEMORY = 7.0 / 8.0
+# Frames in which the phase is estimated: the first ones, and then every so many; fewer where nobody declared one.
+_FIRST_LOOKS, _LOOK_EVERY = 8, 8
+_FIRST_UNDECLARED, _EVERY_UNDECLARED = 3, 64
+
+
+@dataclass(frozen=True)
+class LinePhase:
+    """What lies at x in even lines is seen at ``x + shift_px`` in odd ones, 0 being even.
+
+    Attributes
+    ----------
+    shift_px, sigma_px
+        The phase and its 1-sigma; infinite where the image does not tell it.
+    """
+
+    shift_px: float
+    sigma_px: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether there is one beyond chance."""
+        return abs(self.shift_px) > max(_SIGMAS * self.sigma_px, _LEAST_PX)
+
+
+def estimate_line_phase(image: AnyImage) -> LinePhase:
+    """Estimate the phase from one image, by lines against the mean of their neighbours.
+
+    Edges at any slant have the same mean in the neighbours as in the line between them. It fails, with a large sigma,
+    on images without structure along the lines, and is wrong by a period where something of a period below twice the
+    phase runs across all lines.
+
+    Parameters
+    ----------
+    image
+        (h, w) or (h, w, 3), at least 16 lines of 32 px.
+    """
+    height, width = image.shape[:2]
+    largest = max(2, int(_LARGEST * width))
+    if height < 16 or width < 8 * largest // 3 or width < 32:
+        return LinePhase(0.0, np.inf)
+    step = 2 * max(1, height // 2 // _MOST_LINES)
+    first = np.arange(1, height - 1, step)
+    line, above, below = (_prepare(image[first + k]) for k in (0, -1, 1))
+    mean = 0.5 * (above + below)
+    window = np.hanning(width + 2)[1:-1].astype(np.float32)
+    spectrum, other = fft.rfft(line * window), fft.rfft(mean * window)
+    correlation = fft.irfft(np.sum(spectrum * np.conj(other), axis=0), width)
+    lags = np.arange(-largest, largest + 1)
+    shift = float(lags[np.argmax(correlation[lags])])
+    frequency = np.asarray(2j * np.pi * fft.rfftfreq(width), dtype=np.complex64)
+    margin = slice(largest + 2, width - largest - 2)
+    groups = np.arange(len(first)) * min(_GROUPS, len(first)) // len(first)
+    whole = fft.rfft(line)
+    # The noise of the two has nothing in common, so that their gradients tell the structure's alone.
+    fixed = fft.irfft(fft.rfft(mean) * frequency, width)[:, margin]
+    sigma = np.inf
+    for _ in range(_STEPS):
+        moved = whole * np.exp(frequency * np.float32(shift))
+        left = (fft.irfft(moved, width) - mean)[:, margin]
+        slope = fft.irfft(moved * frequency, width)[:, margin]
+        scores, total = np.sum(slope * left, axis=1), float(np.sum(slope * fixed))
+        if total <= 0.0:
+            return LinePhase(0.0, np.inf)
+        step = float(scores.sum()) / total
+        shift -= step
+        spread = np.bincount(groups, weights=scores)
+        sigma = float(np.std(spread, ddof=1) * np.sqrt(len(spread))) / total
+        if abs(shift) > largest:
+            return LinePhase(0.0, np.inf)
+        if abs(step) < _ENOUGH * sigma:
+            break
+    return LinePhase(shift, sigma)
+
+
+def _prepare(lines: AnyImage) -> Array32:
+    """Grey lines without their mean, smoothed along themselves."""
+    grey = lines.mean(axis=2) if lines.ndim == 3 else lines
+    smooth = cv2.GaussianBlur(
+        np.asarray(grey, dtype=np.float32), (0, 0), sigmaX=_SMOOTH_PX, sigmaY=1e-6
+    )
+    return np.asarray(smooth - smooth.mean(axis=1, keepdims=True))
+
+
+def remove_line_phase(image: AnyImage, shift_px: float) -> AnyImage:
+    """Return the image with even and odd lines moved towards each other, by half of the phase each.
+
+    Parameters
+    ----------
+    image
+        (h, w) or (h, w, 3); of another type than 8 or 16 bits and float32, it becomes float32.
+    shift_px
+        As in :class:`LinePhase`.
+    """
+    if image.dtype.name not in RESAMPLED_TYPES:
+        image = image.astype(np.float32)
+    out = np.empty_like(image)
+    for parity, moved in ((0, 0.5 * shift_px), (1, -0.5 * shift_px)):
+        lines: Any = np.ascontiguousarray(image[parity::2])
+        # OpenCV's own resampling rounds positions to 1/32 px.
+        reach = int(np.ceil(abs(moved))) + _LOBES
+        distance = np.arange(-reach, reach + 1) + moved
+        taps = np.sinc(distance) * np.sinc(distance / _LOBES) * (np.abs(distance) < _LOBES)
+        out[parity::2] = cv2.sepFilter2D(
+            lines, -1, taps / taps.sum(), np.array([1.0]), borderType=cv2.BORDER_REPLICATE
+        )
+    return out
+
+
+class LinePhaseCorrector:
+    """Frees the frames of a stream of their line phase, or says that they have one that nobody declared.
+
+    Parameters
+    ----------
+    declared
+        Whether the scan is bidirectional. If not, frames stay as they are.
+    """
+
+    def __init__(self, declared: bool) -> None:
+        self.declared = declared
+        self.phase = LinePhase(0.0, np.inf)
+        self._frames = 0
+        self._size: tuple[int, ...] = ()
+
+    def correct(self, image: AnyImage) -> AnyImage:
+        """Return the frame without its line phase, in which :attr:`phase` is the mean of the last estimates."""
+        if image.shape != self._size:
+            self._size, self._frames, self.phase = image.shape, 0, LinePhase(0.0, np.inf)
+        looks, every = (
+            (_FIRST_LOOKS, _LOOK_EVERY) if self.declared else (_FIRST_UNDECLARED, _EVERY_UNDECLARED)
+        )
+        if self._frames < looks or self._frames % every == 0:
+            self._add(estimate_line_phase(image))
+        self._frames += 1
+        if not self.declared or not np.isfinite(self.phase.sigma_px):
+            return image
+        return remove_line_phase(image, self.phase.shift_px)
+
+    @property
+    def note(self) -> str:
+        """The phase that was removed, or that nobody declared; empty if there is none."""
+        if not self.phase.is_seen:
+            return ""
+        size = f"{self.phase.shift_px:.2f} +- {self.phase.sigma_px:.1g} px"
+        if self.declared:
+            return f"odd lines, which were shifted against even ones by {size}, were moved back"
+        return (
+            f"odd lines are shifted against even ones by {size}, as in a bidirectional scan or an interlaced video: "
+            "declare bidirectional: true under scan in the configuration"
+        )
+
+    def _add(self, found: LinePhase) -> None:
+        old = self.phase
+        if not np.isfinite(found.sigma_px):
+            return
+        apart = abs(found.shift_px - old.shift_px)
+        if not apart < _SIGMAS * np.hypot(found.sigma_px, old.sigma_px):
+            # Another dwell or magnification has another lag.
+            self.phase = found
+            return
+        if not np.isfinite(old.sigma_px):
+            self.phase = found
+            return
+        weights = np.array([_MEMORY * old.sigma_px**-2.0, max(found.sigma_px, 1e-6) ** -2.0])
+        shift = float(weights @ [old.shift_px, found.shift_px] / weights.sum())
+        self.phase = LinePhase(shift, float(weights.sum() ** -0.5))
