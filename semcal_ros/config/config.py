@@ -84,6 +84,13 @@ def _read_unit(value: Any) -> Any:
     return "1" if isinstance(value, (int, float)) and value == 1 and value is not True else value
 
 
+def _check_rectangle(part: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    left, top, right, bottom = part
+    if not (left < right and top < bottom):
+        raise ValueError("not a rectangle")
+    return part
+
+
 def _sort_largest_first(sizes: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(sorted(sizes, reverse=True))
 
@@ -108,6 +115,9 @@ _SquareSize = Annotated[_Number, Field(gt=0.0, le=1.0)]
 # A stage that is known to no better than half a radian or ten millimetres is not known at all.
 _AngleSigma = Annotated[_Number, Field(gt=0.0, le=0.5)]
 _LengthSigma = Annotated[_Number, Field(gt=0.0, le=0.01)]
+
+# Of a side of a picture.
+_Part = Annotated[_Number, Field(ge=0.0, le=1.0)]
 
 _FILE = ConfigDict(extra="forbid")
 _TOPIC = "a ROS topic name such as image_raw"
@@ -329,6 +339,9 @@ class MicroscopeConfig:
         the stage out.
     frame_id
         Frame for images that the suite itself makes (virtual microscope, imported files).
+    follow
+        Left, top, right and bottom of a part of the pictures that shows the specimen and no tool, as parts of their
+        width and height; the drift is that of what moves as it does. None where nothing is known.
     """
 
     name: Annotated[str, Field(strict=True, min_length=1, max_length=100)] = Field(
@@ -361,6 +374,12 @@ class MicroscopeConfig:
         default=StageConfig(), description="a mapping of stage settings"
     )
     frame_id: _Frame = Field(default="sem_optical", description="a frame name such as sem_optical")
+    follow: (
+        Annotated[tuple[_Part, _Part, _Part, _Part], AfterValidator(_check_rectangle)] | None
+    ) = Field(
+        default=None,
+        description="left, top, right and bottom of a part of the pictures, from 0 to 1, such as [0.5, 0, 1, 1]",
+    )
 
     @property
     def start_offset_s(self) -> float:

@@ -47,6 +47,7 @@ from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.bags.stage import find_stage
 from semcal_ros.files.bags.topics import find_image_topic, find_topic
+from semcal_ros.files.images.databar import find_databar
 from semcal_ros.files.images.image_series import (
     ImageSeries,
     SeriesImage,
@@ -495,6 +496,8 @@ class _BagRecording(Recording):
         self._given = given
         rows = given.databar_rows
         self._databar_rows = config.image.databar_rows if rows is None else rows
+        # Cut off only where it is stated: the nodes see the same images, and take them as the configuration says.
+        self._looks_for_databar = rows is None and self._databar_rows == 0
         self._reader = open_bag(path)
         self._track: MagnificationTrack | None = None
         try:
@@ -667,6 +670,13 @@ class _BagRecording(Recording):
         """The frame of a message (``None`` without magnification); whether it has a stamp."""
         message = self._reader.decode(raw)
         pixels, encoding = decoded_image(message)
+        if self._looks_for_databar:
+            self._looks_for_databar = False
+            if found := find_databar(pixels):
+                self._notes.append(
+                    f"the lowest {found} rows look like a data bar, and are part of the images: --databar-rows {found} "
+                    "(image.databar_rows in a configuration) cuts it off, and 0 says that there is none"
+                )
         return self._place(raw, message, without_databar(pixels, self._databar_rows), encoding)
 
     def _conditions_at(self, stamp_ns: int, log_time_ns: int) -> Conditions | None:

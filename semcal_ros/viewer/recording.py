@@ -322,7 +322,7 @@ class RecordingSource:
     # -- drift -------------------------------------------------------------------------------------------
 
     def _follow(self) -> None:
-        follower = DriftFollower(hindsight=False)
+        follower = DriftFollower(hindsight=False, follow=self._config.follow)
         # The recording was readable; what is damaged further on is told by the other thread.
         with suppress(SemcalError), self._open() as recording:
             for number, frame in recording.frames_from(0):

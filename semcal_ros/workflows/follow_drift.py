@@ -34,6 +34,7 @@ from semcal_ros.core.drift.frame_time import (
 )
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.files.recordings import RecordedFrame
 
 __all__ = [
@@ -75,11 +76,21 @@ class DriftFollower:
     ----------
     hindsight
         Whether to keep the data for smoothing; without them only the current drift is known.
+    follow
+        The part of the pictures that shows the specimen, as in a
+        :class:`~semcal_ros.config.config.MicroscopeConfig`.
     """
 
-    def __init__(self, *, hindsight: bool = True) -> None:
+    def __init__(
+        self,
+        *,
+        hindsight: bool = True,
+        follow: tuple[float, float, float, float] | None = None,
+    ) -> None:
         self.history = DriftHistory() if hindsight else None
-        self.tracker = DriftTracker(DriftSettings(similarity=True), history=self.history)
+        registration = RegistrationSettings(follow=follow)
+        settings = DriftSettings(registration=registration, similarity=True)
+        self.tracker = DriftTracker(settings, history=self.history)
         self.updates: list[DriftUpdate] = []
         self._smoothed: DriftPath | None = None
 

@@ -195,7 +195,8 @@ def rectify(
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model, frame_time_s)
-    follower = DriftFollower(hindsight=microscope.scan is None) if drift else None
+    hindsight, follow = microscope.scan is None, microscope.follow
+    follower = DriftFollower(hindsight=hindsight, follow=follow) if drift else None
     rectifier = Rectifier(interpolation)
     topics = absolute_namespace(namespace)
     kind = None if output is None else _choose_kind(output, scale_bar)

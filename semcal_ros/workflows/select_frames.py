@@ -171,7 +171,8 @@ class _Reading:
     ) -> tuple[_Taken, FrameSelection]:
         counts: Counter[str] = Counter()
         wanted = None if self.at is None else _format_magnification(self.at)
-        taken = _Taken(DriftFollower() if self.drift else None)
+        follow = self.opened.config.follow
+        taken = _Taken(DriftFollower(follow=follow) if self.drift else None)
         first: RecordedFrame | None = None
         stage = "drift" if self.drift else "reading"
         advance = count_frames(on_progress, stage, self.opened.frame_count)

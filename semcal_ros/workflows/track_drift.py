@@ -235,7 +235,7 @@ def _follow(
     on_progress: OnProgress,
 ) -> tuple[list[int], DriftFollower]:
     """Track all frames; return their stamps and drift."""
-    follower = DriftFollower()
+    follower = DriftFollower(follow=microscope.follow)
     stamps_ns: list[int] = []
     advance = count_frames(on_progress, "drift", opened.frame_count)
     for frame in opened.frames():

@@ -58,6 +58,7 @@ squares_sigma: 1e-3
 grid_certificate: PTB 4711
 stage: {topic: /sem/axes, tilt: T, tilt_axis_deg: 90, sigma: {tilt: 0.01}}
 frame_id: sem
+follow: [0.5, 0, 1, 1]
 """
 
 
@@ -175,6 +176,7 @@ def test_all_keys_are_read() -> None:
     )
     assert config.stage is not None and config.stage.rotation == "rotation"
     assert config.frame_id == "sem"
+    assert config.follow == (0.5, 0.0, 1.0, 1.0)
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.name = "other"  # type: ignore[misc]
 
@@ -241,6 +243,8 @@ def test_without_scan_a_frame_is_an_instant() -> None:
         ("scan.recursive_averages", 1.5),
         ("scan.flyback_fraction", 1),
         ("scan.flyback_fraction", float("nan")),
+        ("scan.bidirectional", 1),
+        ("follow", [0.5, 0.0, 0.5, 1.0]),
         ("squares_m", []),
         ("squares_m", 1e-6),
         ("frame_id", ""),
@@ -426,3 +430,9 @@ def test_arguments_given_by_place_are_named():
         MicroscopeConfig("a", 0)
     with pytest.raises(ConfigError, match="ImageConfig: key databar_rows is -1"):
         ImageConfig(databar_rows=-1)
+
+
+@pytest.mark.parametrize("value", [[0.5, 0.0, 1.0], [0, 0, 512, 512]])
+def test_a_part_to_follow_is_in_parts_of_the_picture(value: list[float]) -> None:
+    with pytest.raises(ConfigError, match=r"mine.yaml: key follow\[.\] is .* from 0 to 1"):
+        parse_config(edited("follow", value), source="mine.yaml")

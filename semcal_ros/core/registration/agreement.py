@@ -112,12 +112,15 @@ class Agreement:
         Part of the compared tiles with structure that agrees.
     pull
         Part of all gradients that does not, and would pull the shift.
+    informs
+        (rows, cols) 0 to 1: what of the gradients of each tile is structure, whether it agrees or not.
     """
 
     weights: Array
     disagrees: Mask
     share: float
     pull: float
+    informs: Array
 
     @property
     def is_complete(self) -> bool:
@@ -181,7 +184,7 @@ def find_agreement(tiles: TileStatistics, noise: TileNoise) -> Agreement:
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * np.trace(tiles.gradient, axis1=-2, axis2=-1)
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
-    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull)
+    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights)
 
 
 def _keep_bodies(disagrees: Mask, least: int) -> Mask:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
 from semcal_ros.core.registration.one_direction import OneDirection, find_direction
 from semcal_ros.core.registration.periodicity import find_periods
@@ -52,6 +53,9 @@ class RegistrationSettings:
     texture_region
         Part of the images, in px of the whole, in which their noise and structure are measured;
         None: their middle. For images whose middle shows something else, such as a covered area.
+    follow
+        Left, top, right and bottom of a part of the images that shows the specimen, as parts of their width and height;
+        what moves as it does is followed. None: what moves as predicted, or nearly all.
     """
 
     min_overlap: float = 0.3
@@ -61,6 +65,25 @@ class RegistrationSettings:
     min_competing_height: float = 0.7
     min_deviations: float = 5.0
     texture_region: Region | None = None
+    follow: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.follow is not None:
+            left, top, right, bottom = self.follow
+            if not (0.0 <= left < right <= 1.0 and 0.0 <= top < bottom <= 1.0):
+                raise InvalidValueError(
+                    f"a part to follow of {self.follow}",
+                    expected="left, top, right and bottom from 0 to 1, in this order",
+                )
+
+    def follow_px(self, size: tuple[int, int], region: Region) -> Region | None:
+        """The part to follow of images of (width, height), in px of their ``region``; None where there is none."""
+        if self.follow is None:
+            return None
+        left, top, right, bottom = (
+            round(part * side) for part, side in zip(self.follow, 2 * size, strict=True)
+        )
+        return left - region[0], top - region[1], right - region[0], bottom - region[1]
 
 
 @dataclass(frozen=True)

@@ -534,7 +534,9 @@ def _register(
     whole = None if repeats or of_parts else look_at_whole(reference, alignment, image_noise)
     kept = None
     if not repeats and (whole is None or not whole.is_complete):
-        kept = keep_specimen(reference, pyramid, alignment, peak, peaks, guess, spread)
+        size = np.shape(image)[1], np.shape(image)[0]
+        follow_px = reference.settings.follow_px(size, inside)
+        kept = keep_specimen(reference, pyramid, alignment, peak, peaks, guess, spread, follow_px)
     if kept is None and isinstance(chosen, Rejection):
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(distances))].shift_px) + origin

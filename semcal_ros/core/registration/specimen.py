@@ -43,7 +43,7 @@ from semcal_ros.core.registration.inverse_compositional import (
 )
 from semcal_ros.core.registration.noise_spectrum import estimate_noise_variance
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
-from semcal_ros.core.registration.reference import Reference
+from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.tiles import Pyramid
 
 __all__ = ["keep_specimen", "look_at_whole"]
@@ -90,8 +90,12 @@ def keep_specimen(
     peaks: list[CoarsePeak],
     guess: Array,
     spread: Array | None,
+    follow_px: Region | None = None,
 ) -> tuple[Alignment | Rejection[MatchFailure], CoarsePeak, MovingTiles | None, float] | None:
-    """The alignment of the specimen alone where not all of the image moves with it; None where all does."""
+    """The alignment of the specimen alone where not all of the image moves with it; None where all does.
+
+    What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part.
+    """
     level = reference.levels[-1]
     noise = TileNoise.of(
         level.sigma_px, reference.noise_variance, _estimate_least_noise(pyramid.full)
@@ -135,20 +139,60 @@ def keep_specimen(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < _SAME_SHIFT_PX for h in found
         ):
             found.append(_Hypothesis(tried, agreement, start))
+            if follow_px is not None:
+                # Another one may be that of the part that is the specimen.
+                continue
             is_near = spread is not None and _is_near(tried, guess, spread)
             if is_near and sigma < _WELL_PREDICTED_PX and agreement.share > _HALF:
                 # No other one can have as much.
                 break
     if not found:
         return None
-    best = _choose_hypothesis(found, guess, spread)
+    best: _Hypothesis | Rejection[MatchFailure]
+    if follow_px is not None:
+        best = _choose_followed(found, reference, follow_px)
+    else:
+        best = _choose_hypothesis(found, guess, spread)
     if isinstance(best, Rejection):
         return best, peak, None, 0.0
     statistics = best.alignment.tile_statistics()
     assert statistics is not None
     moving = _moving_tiles(reference, statistics, best)
     shown = moving if moving.share > 0.0 else None
-    return best.alignment, best.start, shown, best.agreement.share
+    share = best.agreement.share
+    if follow_px is not None:
+        share = _share_inside(best, reference, follow_px)
+    return best.alignment, best.start, shown, share
+
+
+def _choose_followed(
+    found: list[_Hypothesis], reference: Reference, follow_px: Region
+) -> _Hypothesis | Rejection[MatchFailure]:
+    """The shift with which a part of the image agrees."""
+    shares = [_share_inside(hypothesis, reference, follow_px) for hypothesis in found]
+    best = int(np.argmax(shares))
+    if shares[best] > _MOST_AGREES:
+        return found[best]
+    return Rejection(
+        MatchFailure.AMBIGUOUS,
+        f"ambiguous: {100.0 * max(shares[best], 0.0):.0f} % of the structure of the part to follow moves by one shift",
+    )
+
+
+def _share_inside(found: _Hypothesis, reference: Reference, part: Region) -> float:
+    """Part of the structure inside a rectangle of the image that agrees with a shift; 0 without structure there."""
+    statistics, level = found.alignment.tile_statistics(), reference.levels[-1]
+    assert statistics is not None
+    corner, side = _first_corner(reference, statistics, found), level.side
+    rows, cols = found.agreement.disagrees.shape
+    x, y = (
+        corner[axis] + (np.arange(count) + 0.5) * side[axis]
+        for axis, count in ((0, cols), (1, rows))
+    )
+    inside = np.outer((y >= part[1]) & (y < part[3]), (x >= part[0]) & (x < part[2]))
+    weight = np.trace(statistics.gradient, axis1=-2, axis2=-1) * found.agreement.informs * inside
+    agreeing = float(weight[~found.agreement.disagrees].sum())
+    return agreeing / max(float(weight.sum()), 1e-30)
 
 
 def _choose_hypothesis(
@@ -181,11 +225,16 @@ def _is_near(alignment: Alignment, guess: Array, spread: Array) -> bool:
 def _moving_tiles(
     reference: Reference, statistics: TileStatistics, found: _Hypothesis
 ) -> MovingTiles:
-    level = reference.levels[-1]
-    side = np.array(level.side, dtype=np.float64)
-    first = np.array([statistics.cols.start, statistics.rows.start])
-    corner = np.array(level.origin) + first * side + found.alignment.shift_px
+    side = np.array(reference.levels[-1].side, dtype=np.float64)
+    corner = _first_corner(reference, statistics, found)
     return MovingTiles.of(found.agreement.disagrees, corner, side)
+
+
+def _first_corner(reference: Reference, statistics: TileStatistics, found: _Hypothesis) -> Array:
+    """(2,) left and top of the first tile in the image."""
+    level = reference.levels[-1]
+    first = np.array([statistics.cols.start, statistics.rows.start])
+    return np.array(level.origin) + first * np.array(level.side) + found.alignment.shift_px
 
 
 def _estimate_least_noise(image: AnyImage) -> float:

@@ -29,6 +29,7 @@ from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import bin_image
 from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
@@ -166,7 +167,11 @@ class LiveDrift:
         values = self._parameters
         # A new tracker: the old one may be in use beside the stream.
         self._tracker = DriftTracker(
-            DriftSettings(rekey_overlap=values["keyframe_overlap"], max_jump=values["max_jump"])
+            DriftSettings(
+                registration=RegistrationSettings(follow=self._config.follow),
+                rekey_overlap=values["keyframe_overlap"],
+                max_jump=values["max_jump"],
+            )
         )
         self._is_beside = False
         self._binned = 1

@@ -36,6 +36,7 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
+from semcal_ros.files.images.databar import find_databar
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
@@ -201,6 +202,8 @@ class FrameInput:
             scan = config.scan
             self._lines = LinePhaseCorrector(scan is not None and scan.bidirectional)
         self._undeclared = ""
+        self._barred = ""
+        self._looked_at: tuple[int, ...] = ()
         self._skips_late = self._images.depth <= image_input().depth
         self._transport = ""
         self._image_bytes = 0
@@ -277,8 +280,21 @@ class FrameInput:
         self._reporter.note("magnification", "unknown" if g is None else g)
         self._reporter.note("frames_mixed", self._mixed)
         self._look_for_light(image)
+        self._look_for_databar(image)
         image = self._without_line_phase(image)
         return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
+
+    def _look_for_databar(self, image: AnyImage) -> None:
+        """Warn of a data bar that the configuration does not tell of, at the first image of a size."""
+        if self._lines is None or self._databar_rows or image.shape == self._looked_at:
+            return
+        self._looked_at = image.shape
+        rows = find_databar(image)
+        self._barred = (
+            f"the lowest {rows} rows look like a data bar: set image.databar_rows" if rows else ""
+        )
+        if self._barred:
+            self._reporter.warn(self._barred)
 
     def _without_line_phase(self, image: AnyImage) -> AnyImage:
         """Move the lines of a bidirectional scan to where they belong; warn of one that nobody declared."""
@@ -330,8 +346,10 @@ class FrameInput:
         return bool(self._images.rivals or self._magnification.rivals)
 
     def conditions(self) -> list[str]:
-        """Return, in a few words, whether images are too large for the transport, dark, or of shifted lines."""
-        return [text for text in (self._transport, self._dark, self._undeclared) if text]
+        """Return, in a few words, what is odd about the images: their size, no light, a data bar, shifted lines."""
+        return [
+            text for text in (self._transport, self._dark, self._barred, self._undeclared) if text
+        ]
 
 
 class StreamNode(SemNode):

@@ -36,6 +36,7 @@ from semcal_ros.nodes.frames.stream import (
     describe_darkness,
     is_late,
 )
+from tests.files.images.test_databar import scanned, with_bar
 from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
 from tests.helpers.node_scenes import image_message, magnification_message, texture
 
@@ -262,3 +263,10 @@ def test_a_line_phase_that_nobody_declared_is_said_once_and_left() -> None:
     bench.receive(1.0, 1.1, 1.2, image=shifted_lines())
     assert np.array_equal(bench.frames[0].image, shifted_lines())
     assert [text for text in bench.log if "odd lines" in text] == bench.input.conditions()
+
+
+def test_a_data_bar_that_the_configuration_does_not_tell_of_is_said() -> None:
+    bench = Bench()
+    bench.receive(1.0, 1.1, image=with_bar(scanned(), 40, "5.0 kV 10 um"))
+    assert bench.input.conditions() == [text for text in bench.log if "data bar" in text]
+    assert "lowest 40 rows" in bench.log[0]

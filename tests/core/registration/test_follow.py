@@ -1,0 +1,63 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A part of the picture that is known to show the specimen tells which of two motions is its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.drift.scenes import KINDS, draw
+from semcal_ros.core.drift.estimates import DriftSettings
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration.reference import RegistrationSettings
+
+
+def test_a_tool_that_was_there_from_the_start_is_left_out_where_the_specimen_is_known() -> None:
+    frames, drift, _ = draw(KINDS["tool over sparse from the start"], 101)
+    settings = DriftSettings(registration=RegistrationSettings(follow=(0.6, 0.0, 1.0, 1.0)))
+    followed, plain = DriftTracker(settings), DriftTracker()
+    accepted = []
+    for k, frame in enumerate(frames[:10]):
+        update = followed.update(frame, float(k))
+        accepted.append(plain.update(frame, float(k)).accepted)
+        assert update.accepted
+        assert np.max(np.abs(update.drift_px - drift[k])) < 0.2
+    assert update.moving is not None
+    # The tip comes in from the left.
+    columns = np.flatnonzero(update.moving.draw(frames[0].shape[::-1]).any(axis=0))
+    assert columns.max() < 0.6 * frames[0].shape[1]
+    assert sum(accepted) < 5
+
+
+def test_a_part_without_structure_is_refused_rather_than_guessed() -> None:
+    frames, _, _ = draw(KINDS["tool over gold from the start"], 101)
+    blank = frames[0].copy()
+    moved = frames[8].copy()
+    for picture in (blank, moved):
+        picture[:40, -40:] = 60
+    settings = DriftSettings(registration=RegistrationSettings(follow=(0.92, 0.0, 1.0, 0.08)))
+    tracker = DriftTracker(settings)
+    tracker.update(blank, 0.0)
+    assert not tracker.update(moved, 1.0).accepted
+
+
+@pytest.mark.parametrize("part", [(0.5, 0.0, 0.5, 1.0), (0.0, 0.0, 1.1, 1.0)])
+def test_a_part_that_is_no_rectangle_of_the_picture_is_an_error(
+    part: tuple[float, float, float, float],
+) -> None:
+    with pytest.raises(InvalidValueError, match="part to follow"):
+        RegistrationSettings(follow=part)
