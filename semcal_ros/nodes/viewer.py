@@ -369,6 +369,7 @@ class Viewer(SemNode):
             self.calibration.current is not None,
             drift_px,
             notes=notes,
+            moving=frame.moving,
         )
 
     def _camera_at(self, g: float, width: int, height: int) -> ScanCamera | None:

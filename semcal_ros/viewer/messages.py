@@ -197,6 +197,7 @@ def encode_view(view: View, wish: Wish, *, age_s: float | None = None) -> bytes:
         "stamp_s": view.stamp_ns * 1e-9,
         "age_ms": None if age_s is None else round(1e3 * age_s, 1),
         "drift_px": None if view.drift_px is None else [round(v, 3) for v in view.drift_px],
+        "moving": view.moving,
         "levels": None
         if levels is None
         else [levels.low, levels.high, levels.least, levels.greatest],

@@ -27,7 +27,19 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Contrast", "Levels", "Region", "choose_levels", "choose_region", "encode_picture"]
+__all__ = [
+    "Contrast",
+    "Levels",
+    "Outlines",
+    "Region",
+    "choose_levels",
+    "choose_region",
+    "encode_picture",
+    "outline",
+]
+
+#: Closed polygons of (x, y) px.
+Outlines = tuple[tuple[tuple[int, int], ...], ...]
 
 # Grey levels that may be lost at either end, percent: hot pixels and the edges of charging.
 _TAIL_PERCENT = 0.5
@@ -81,6 +93,12 @@ class Levels:
     high: float
     least: float
     greatest: float
+
+
+def outline(mask: NDArray[Any]) -> Outlines:
+    """Return the outlines of what is not 0 in an image (h, w) of 8 bits."""
+    found, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return tuple(tuple((int(x), int(y)) for x, y in points[:, 0]) for points in found)
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,13 @@ from numpy.typing import NDArray
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.drift.estimates import DriftEstimate
+from semcal_ros.core.drift.estimates import DriftEstimate, DriftUpdate
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.viewer.lengths import format_with_sigma
+from semcal_ros.viewer.pictures import Outlines, outline
 from semcal_ros.viewer.source import DriftPanel, Note, Rate, Status, Timeline, View
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 from semcal_ros.workflows.follow_drift import DriftFollower, camera_for, start_time_s
@@ -82,7 +83,7 @@ class RecordingSource:
         self._follows = drift
         self._rectifier = Rectifier()
         self._trace = DriftTrace()
-        self._known: dict[int, DriftEstimate] = {}
+        self._known: dict[int, DriftUpdate] = {}
         self._stamps: list[int] = []
         self._followed = 0
         self._complete = False
@@ -299,8 +300,10 @@ class RecordingSource:
             self._problem = f"frame {index + 1}: {error}"
             return
         notes: dict[str, object] = {"recording": self.name, "frame": index}
-        drift_px = None
+        drift_px: tuple[float, float] | None = None
+        moving: Outlines = ()
         if estimate is not None:
+            moving = _outline_moving(estimate, corrected)
             drift_px = drift_in_pixels(camera, estimate.drift_m)
             notes.update(drift_x_m=float(estimate.drift_m[0]), drift_y_m=float(estimate.drift_m[1]))
         pictures = {"raw": frame.image, "corrected": corrected}
@@ -317,6 +320,7 @@ class RecordingSource:
             drift_px,
             frame.file_name or f"frame {index + 1}",
             notes,
+            moving,
         )
 
     # -- drift -------------------------------------------------------------------------------------------
@@ -345,6 +349,14 @@ class RecordingSource:
             with self._changed:
                 self._renew = True
                 self._changed.notify_all()
+
+
+def _outline_moving(update: DriftUpdate, corrected: NDArray[Any]) -> Outlines:
+    """Outlines of what did not move with the specimen, in the corrected picture."""
+    if update.moving is None:
+        return ()
+    height, width = corrected.shape[:2]
+    return outline(update.moving.draw((width, height), moved_px=-update.drift_px))
 
 
 def _sigma_m(estimate: DriftEstimate) -> float:

@@ -22,6 +22,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.viewer.pictures import Outlines
 
 __all__ = [
     "ACTIONS",
@@ -69,6 +70,8 @@ class View:
         Of the file or frame, for a recording.
     notes
         What a snapshot's file says beside scale and time.
+    moving
+        Outlines, px of the corrected picture, of what does not move with the specimen.
     """
 
     number: int
@@ -79,6 +82,7 @@ class View:
     drift_px: tuple[float, float] | None = None
     name: str = ""
     notes: dict[str, object] = field(default_factory=dict)
+    moving: Outlines = ()
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from semcal_ros.viewer.pictures import (
     choose_levels,
     choose_region,
     encode_picture,
+    outline,
 )
 
 
@@ -103,3 +104,15 @@ def test_wrong_contrasts_are_refused() -> None:
     for wrong in (("auto", 5.0, 5.0), ("auto", 0.0, float("inf")), ("best", 0.0, 1.0)):
         with pytest.raises(InvalidValueError):
             Contrast(*wrong)
+
+
+def test_a_mask_is_outlined_by_its_corners() -> None:
+    mask = np.zeros((40, 60), np.uint8)
+    mask[10:20, 30:50] = 255
+    assert {point for points in outline(mask) for point in points} == {
+        (30, 10),
+        (30, 19),
+        (49, 19),
+        (49, 10),
+    }
+    assert outline(np.zeros((40, 60), np.uint8)) == ()

@@ -157,3 +157,24 @@ def test_what_cannot_be_shown_is_refused(source: RecordingSource, tmp_path: Path
     assert source.overlay() is None
     with pytest.raises(BagError):
         show(tmp_path / "nothing")
+
+
+def test_what_moves_by_itself_is_outlined(tmp_path: Path) -> None:
+    """A patch that stays in the picture while the specimen moves by 2 px a frame to the right."""
+    whole, patch = texture(1, 224), texture(2, 40)
+    frames = [whole[32:192, 40 - 2 * k : 200 - 2 * k].copy() for k in range(6)]
+    for frame in frames[2:]:
+        frame[60:100, 30:70] = patch
+    tifffile.imwrite(tmp_path / "tool.tif", np.stack(frames))
+    files = RecordedFiles(tmp_path / "tool.tif", pixel_size_m=10e-9, frame_interval_s=1.0)
+    source = show(files, None, drift=True)
+    try:
+        wait_for(lambda: "all frames is known" in source.describe().notes[-1].text)
+        source.act("seek", 5.0)
+        view = wait_for(lambda: (v := source.newest()) and v.notes["frame"] == 5 and v)
+        (places,) = (np.array(points) for points in view.moving)
+        # It covers tiles of some 20 px, and lies 10 px farther left where the drift is taken out.
+        assert np.allclose(places.mean(axis=0), (40.0, 80.0), atol=12.0)
+        assert np.all(np.ptp(places, axis=0) > 30.0)
+    finally:
+        source.close()

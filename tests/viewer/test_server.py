@@ -41,6 +41,7 @@ from tests.helpers.node_scenes import make_calibration, texture
 
 CAMERA = make_calibration().at(2000.0)
 RAW = texture(3).astype(np.uint16) * 16
+MOVING = (((1, 2), (3, 2), (3, 5)),)
 
 
 class Source:
@@ -50,7 +51,9 @@ class Source:
         self.pages: list[int] = []
         self.acts: list[tuple[str, float | tuple[float, ...] | None]] = []
         pictures: dict[str, NDArray[Any]] = {"raw": RAW, "corrected": RAW[::-1].copy()}
-        self.view = View(1, 1_700_000_000 * 10**9, pictures, CAMERA, True, (2.0, 1.0))
+        self.view = View(
+            1, 1_700_000_000 * 10**9, pictures, CAMERA, True, (2.0, 1.0), moving=MOVING
+        )
 
     def watch(self, pages: int) -> None:
         self.pages.append(pages)
@@ -144,6 +147,7 @@ def test_state_and_pictures_come(server: PageServer, source: Source) -> None:
     assert scale["nm_per_px"] == pytest.approx(1e9 * CAMERA.rectified.pixel_size_m[0])
     assert "±" in scale["bar_label"]
     assert header["drift_px"] == [2.0, 1.0]
+    assert header["moving"] == [[[1, 2], [3, 2], [3, 5]]]
     assert source.pages[0] == 1
     assert source.pages[-1] == 0
 

@@ -48,6 +48,17 @@ STATES = {
     "3 frames dropped or rejected": ("warn", "3 of the last frames", "if it goes on"),
     "last rejection: encoding bgra8, expected mono8": ("warn", "bgra8, expected mono8", "correct"),
     "uncalibrated": ("warn", "nominal", "calibrate"),
+    "the lowest 40 rows look like a data bar: set image.databar_rows": (
+        "warn",
+        "lowest 40 rows",
+        "set image",
+    ),
+    "odd lines are shifted against even ones by 2.00 +- 0.01 px, as in a bidirectional scan or an interlaced video: "
+    "declare bidirectional: true under scan in the configuration": (
+        "warn",
+        "by 2.00 +- 0.01 px",
+        "if the scan is",
+    ),
     "scale of the calibration: a warning: few tilts": ("warn", "few tilts", "see the report"),
     "magnification outside the calibrated range": ("warn", "magnification", "go back"),
     "other conditions: voltage 10 kV, calibrated at 5 kV": ("warn", "5 kV", "check"),

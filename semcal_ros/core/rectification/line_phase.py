@@ -25,7 +25,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy import fft
 
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array32
 
@@ -92,21 +91,21 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
     line, above, below = (_prepare(image[first + k]) for k in (0, -1, 1))
     mean = 0.5 * (above + below)
     window = np.hanning(width + 2)[1:-1].astype(np.float32)
-    spectrum, other = fft.rfft(line * window), fft.rfft(mean * window)
-    correlation = fft.irfft(np.sum(spectrum * np.conj(other), axis=0), width)
+    spectrum, other = np.fft.rfft(line * window), np.fft.rfft(mean * window)
+    correlation = np.fft.irfft(np.sum(spectrum * np.conj(other), axis=0), width)
     lags = np.arange(-largest, largest + 1)
     shift = float(lags[np.argmax(correlation[lags])])
-    frequency = np.asarray(2j * np.pi * fft.rfftfreq(width), dtype=np.complex64)
+    frequency = np.asarray(2j * np.pi * np.fft.rfftfreq(width), dtype=np.complex64)
     margin = slice(largest + 2, width - largest - 2)
     groups = np.arange(len(first)) * min(_GROUPS, len(first)) // len(first)
-    whole = fft.rfft(line)
+    whole = np.fft.rfft(line)
     # The noise of the two has nothing in common, so that their gradients tell the structure's alone.
-    fixed = fft.irfft(fft.rfft(mean) * frequency, width)[:, margin]
+    fixed = np.fft.irfft(np.fft.rfft(mean) * frequency, width)[:, margin]
     sigma = np.inf
     for _ in range(_STEPS):
         moved = whole * np.exp(frequency * np.float32(shift))
-        left = (fft.irfft(moved, width) - mean)[:, margin]
-        slope = fft.irfft(moved * frequency, width)[:, margin]
+        left = (np.fft.irfft(moved, width) - mean)[:, margin]
+        slope = np.fft.irfft(moved * frequency, width)[:, margin]
         scores, total = np.sum(slope * left, axis=1), float(np.sum(slope * fixed))
         if total <= 0.0:
             return LinePhase(0.0, np.inf)

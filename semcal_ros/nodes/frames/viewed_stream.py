@@ -38,6 +38,7 @@ from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, published_ns
+from semcal_ros.viewer.pictures import Outlines, outline
 
 __all__ = ["PolledGroup", "ViewedFrame", "ViewedImages"]
 
@@ -88,11 +89,14 @@ class ViewedFrame:
         Its stamp, and when the raw image was published (the corrected one, where that is all there is).
     pictures
         ``raw``, ``corrected`` or both; without data bar.
+    moving
+        Outlines of what does not move with the specimen, in the corrected picture.
     """
 
     stamp_ns: int
     sent_ns: int
     pictures: dict[str, NDArray[Any]]
+    moving: Outlines = ()
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,11 @@ class ViewedImages:
             topic: self._subscribe(endpoints, Image, topic, stream_output(1), group)
             for topic in ("image_rect", "image_stabilized")
         }
+        self._moving = {
+            node: self._subscribe(endpoints, Image, f"{node}/moving", stream_output(1), group)
+            for node in ("stream_corrector", "drift_compensator")
+        }
+        self._mask: _Waiting | None = None
         self._kept: deque[_Waiting] = deque()
         self._newest: _Waiting | None = None
         self._seen_s = 0.0
@@ -147,7 +156,7 @@ class ViewedImages:
     @property
     def subscriptions(self) -> list[AdaptiveSubscription]:
         """What is to be paused while nobody looks."""
-        return [self._raw, *self._corrected.values()]
+        return [self._raw, *self._corrected.values(), *self._moving.values()]
 
     def publishers(self, picture: str) -> list[str]:
         """Return the full names of the nodes that publish the raw or the corrected images."""
@@ -157,7 +166,7 @@ class ViewedImages:
     def forget(self) -> None:
         """Forget all images."""
         self._kept.clear()
-        self._newest = self._shown = None
+        self._newest = self._shown = self._mask = None
 
     def take(self) -> ViewedFrame | None:
         """Return the newest frame, or None if it is the same as before.
@@ -173,6 +182,9 @@ class ViewedImages:
             while (taken := subscription.take()) is not None:
                 self._newest, self._seen_s = _waiting(taken), now_s
                 break
+        for subscription in self._moving.values():
+            while (taken := subscription.take()) is not None:
+                self._mask = _waiting(taken)
         corrected = self._newest if now_s - self._seen_s < _STALE_S else None
         raw = self._raw_of(corrected)
         if raw is None and corrected is None:
@@ -192,7 +204,11 @@ class ViewedImages:
             pictures["corrected"] = self._unpack(corrected, Image)
         first = raw or corrected
         assert first is not None
-        return ViewedFrame((corrected or first).stamp_ns, first.sent_ns, pictures)
+        moving: Outlines = ()
+        if corrected is not None and self._mask is not None:
+            # The mask follows its picture; that of the frame before is as good for the eye.
+            moving = outline(self._unpack(self._mask, Image))
+        return ViewedFrame((corrected or first).stamp_ns, first.sent_ns, pictures, moving)
 
     def _take_raw(self) -> None:
         while (taken := self._raw.take()) is not None:

@@ -236,6 +236,7 @@ function draw() {
     pen.font = `${13 * ratio}px system-ui, "DejaVu Sans", sans-serif`;
     drawBar(pen, picture, ratio, width, height);
     if (name === "raw") drawArrow(pen, picture, ratio, width, height);
+    else drawMoving(pen, picture, ratio);
     drawRuler(pen, name, picture, ratio);
   }
 }
@@ -279,6 +280,14 @@ function drawArrow(pen, picture, ratio, width, height) {
   // Beyond the tip, where it hides nothing of the arrow; the text stands on its place.
   const [ux, uy] = [dx / length, dy / length], away = 8 * ratio, half = pen.measureText(words).width / 2;
   label(pen, ratio, words, end[0] + ux * (half + away), Math.max(end[1] + uy * 2 * away + 8 * ratio, 20 * ratio), "center");
+}
+function drawMoving(pen, picture, ratio) {
+  for (const points of state.header.moving ?? []) {
+    const places = points.map((point) => toScreen(picture, point, pen.canvas));
+    line(pen, ratio, "#ff8fa3", [...places, places[0]]);
+    const top = places.reduce((a, b) => (b[1] < a[1] ? b : a));
+    label(pen, ratio, "moves by itself", top[0], Math.max(top[1] - 6 * ratio, 20 * ratio), "center");
+  }
 }
 function toScreen(picture, [x, y], canvas) {
   const [left, top, w] = picture.region, scale = canvas.width / w;

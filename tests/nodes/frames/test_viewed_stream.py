@@ -21,11 +21,14 @@ from typing import Any
 
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
+from semcal_ros.config.config import load_config
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription
-from semcal_ros.nodes.frames.viewed_stream import PolledGroup
+from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedImages
+from tests.helpers.node_fakes import FakeEndpoints
 from tests.helpers.node_scenes import image_message
 from tests.helpers.ros_process import Peer
 
@@ -85,3 +88,18 @@ def test_a_publisher_that_offers_less_is_heard_once_events_are_open(peer: Peer) 
 
     peer.wait_for(heard, "an image of the publisher")
     assert subscription.downgraded == "reliability"
+
+
+def test_what_moves_by_itself_is_outlined_in_the_corrected_picture() -> None:
+    endpoints: Any = FakeEndpoints()
+    images = ViewedImages(load_config("virtual_sem"), endpoints, PolledGroup())
+    mask = np.zeros((32, 32), np.uint8)
+    mask[8:16, 4:20] = 255
+    info = {"source_timestamp": 1, "received_timestamp": 1}
+    for topic, image in (("image_stabilized", mask + 7), ("stream_corrector/moving", mask)):
+        data = serialize_message(image_message(image, 1.0))
+        endpoints.subscriptions[topic].waiting.append((data, info))
+    frame = images.take()
+    assert frame is not None
+    (points,) = frame.moving
+    assert {(4, 8), (19, 8), (19, 15), (4, 15)} == set(points)
