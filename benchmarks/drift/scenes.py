@@ -409,13 +409,36 @@ def run(kind: Kind, seed: int) -> Outcome:
     return Outcome(np.array([u.accepted for u in updates]), errors, scores, bound)
 
 
+def draw_figure(name: str, seed: int, chosen: Sequence[int], path: str) -> None:
+    """Write pictures of a scene, as they come, with outlines of what was found to move by itself."""
+    frames, _, _ = draw(KINDS[name], seed)
+    tracker = DriftTracker()
+    shown = []
+    for k, frame in enumerate(frames):
+        moving = tracker.update(frame, float(k)).moving
+        if k not in chosen:
+            continue
+        picture = cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR)
+        if moving is not None:
+            mask = moving.draw((frame.shape[1], frame.shape[0]))
+            outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+            cv2.drawContours(picture, outlines, -1, (0, 0, 0), 5)
+            cv2.drawContours(picture, outlines, -1, (163, 143, 255), 2)
+        shown.append(cv2.copyMakeBorder(picture, 4, 4, 4, 4, cv2.BORDER_CONSTANT, value=(255,) * 3))
+    cv2.imwrite(path, np.hstack(shown), [cv2.IMWRITE_WEBP_QUALITY, 60])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the fleet; 1 beyond the limits."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift.scenes")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", default="", help="kinds, separated by commas")
     parser.add_argument("--quick", action="store_true", help="one seed")
+    parser.add_argument("--figure", help="write the figure of the documentation instead")
     chosen = parser.parse_args(arguments)
+    if chosen.figure:
+        draw_figure("tool over gold", 100, (0, 9, 18, 29), chosen.figure)
+        return 0
     names = [n.strip() for n in chosen.only.split(",") if n.strip()] or list(KINDS)
     rows: list[list[object]] = []
     failed = False

@@ -285,8 +285,8 @@ function drawMoving(pen, picture, ratio) {
   for (const points of state.header.moving ?? []) {
     const places = points.map((point) => toScreen(picture, point, pen.canvas));
     line(pen, ratio, "#ff8fa3", [...places, places[0]]);
-    const top = places.reduce((a, b) => (b[1] < a[1] ? b : a));
-    label(pen, ratio, "moves by itself", top[0], Math.max(top[1] - 6 * ratio, 20 * ratio), "center");
+    const [x, y] = [0, 1].map((axis) => places.reduce((sum, place) => sum + place[axis], 0) / places.length);
+    label(pen, ratio, "moves by itself", x, y, "center");
   }
 }
 function toScreen(picture, [x, y], canvas) {
