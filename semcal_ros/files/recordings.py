@@ -80,6 +80,8 @@ ENCODINGS = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
 # Beyond these, a unit was forgotten: from a tenth of a picometre, far below an atom, to a metre for
 # the pixel of a photograph; from a photographed wall to what bags accept; from a microsecond, which
 # no raster scan reaches, to the time limit of a configuration's frame.
+# Images of a bag in which a data bar is looked for.
+_LOOKED_AT = 3
 _RANGES = {
     "pixel_size_m": (1e-13, 1.0, "m", "state the unit, as in --pixel-size 43.9nm"),
     "magnification": (1e-3, MAGNIFICATION_LIMITS[1], "", "correct --magnification"),
@@ -496,8 +498,6 @@ class _BagRecording(Recording):
         self._given = given
         rows = given.databar_rows
         self._databar_rows = config.image.databar_rows if rows is None else rows
-        # Cut off only where it is stated: the nodes see the same images, and take them as the configuration says.
-        self._looks_for_databar = rows is None and self._databar_rows == 0
         self._reader = open_bag(path)
         self._track: MagnificationTrack | None = None
         try:
@@ -515,6 +515,26 @@ class _BagRecording(Recording):
         self._notes.extend(notes)
         self._conditions = find_conditions(self._reader, self._image_topic.name)
         self._moved = 0
+        if rows is None and self._databar_rows == 0:
+            self._cut_databar()
+
+    def _cut_databar(self) -> None:
+        """Find a bar of text that the configuration does not tell of in some images, and note it."""
+        found: list[int] = []
+        for raw in self._reader.raw_messages([self._image_topic.name]):
+            try:
+                pixels, _ = decoded_image(self._reader.decode(raw))
+            except SemcalError:
+                continue
+            found.append(find_databar(pixels))
+            if len(found) == _LOOKED_AT or not found[-1]:
+                break
+        if found and found[0] and len(set(found)) == 1:
+            self._databar_rows = found[0]
+            self._notes.append(
+                f"the lowest {found[0]} rows are a data bar and are cut off; --databar-rows 0 keeps them, and nodes "
+                f"cut them off where the configuration has image.databar_rows: {found[0]}"
+            )
 
     def _find_magnification(self, source: MagnificationConfig) -> BagTopic | None:
         """The topic of the magnification; None where the user states it."""
@@ -670,13 +690,6 @@ class _BagRecording(Recording):
         """The frame of a message (``None`` without magnification); whether it has a stamp."""
         message = self._reader.decode(raw)
         pixels, encoding = decoded_image(message)
-        if self._looks_for_databar:
-            self._looks_for_databar = False
-            if found := find_databar(pixels):
-                self._notes.append(
-                    f"the lowest {found} rows look like a data bar, and are part of the images: --databar-rows {found} "
-                    "(image.databar_rows in a configuration) cuts it off, and 0 says that there is none"
-                )
         return self._place(raw, message, without_databar(pixels, self._databar_rows), encoding)
 
     def _conditions_at(self, stamp_ns: int, log_time_ns: int) -> Conditions | None:

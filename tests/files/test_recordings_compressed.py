@@ -37,7 +37,8 @@ from semcal_ros.config.config import (
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
-from semcal_ros.files.recordings import RecordedFrame, open_recording
+from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, open_recording
+from tests.files.images.test_databar import scanned, with_bar
 
 T0 = 1_700_000_000 * 10**9
 RAW = MicroscopeConfig(name="test", display_width_m=0.12)
@@ -206,3 +207,21 @@ def test_an_outline_needs_no_decoding(tmp_path: Path, codec: str) -> None:
         (f.stamp_ns, f.encoding, f.magnification) for f in frames
     ]
     assert outlines[0].digest != outlines[1].digest == outlines[2].digest
+
+
+@pytest.mark.parametrize("databar_rows", [None, 0, 12])
+def test_a_data_bar_that_nobody_told_of_is_cut_off_and_said(
+    tmp_path: Path, databar_rows: int | None
+) -> None:
+    barred = [with_bar(scanned(), 30, f"5.0 kV {k} um") for k in range(4)]
+    made = [
+        ("/sem/image_raw", message(barred_picture, "mono8", T0 + (k + 1) * 1_000_000))
+        for k, barred_picture in enumerate(barred)
+    ]
+    given = RecordedFiles(recorded(tmp_path / "bag", *made), databar_rows=databar_rows)
+    with open_recording(given, RAW) as recording:
+        frames = list(recording.frames())
+        notes = [text for text in recording.notes if "data bar" in text]
+    expected = 200 if databar_rows is None else 230 - databar_rows
+    assert {frame.image.shape[0] for frame in frames} == {expected}
+    assert bool(notes) is (databar_rows is None)

@@ -34,7 +34,7 @@ from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.saddle import LatticeStatus
 from semcal_ros.core.errors import Rejection
 
-__all__ = ["find_lines", "fit_directions"]
+__all__ = ["LineFit", "find_lines", "fit_lines"]
 
 # Side of the part of the picture, at each of its scales, in which the frequency is looked for, px.
 _PART_PX = 1024
@@ -133,8 +133,24 @@ def find_lines(
     return Lattice(lattice.ij, enlarged(lattice.xy, factor), lattice.axes * factor)
 
 
-def fit_directions(ij: Indices, xy: Array) -> Array:
-    """Fit the directions of lines at all places on them, by a polynomial through these.
+@dataclass(frozen=True)
+class LineFit:
+    """A polynomial through all places on the lines of a grating.
+
+    Attributes
+    ----------
+    along
+        (n, 2) unit vectors towards growing j.
+    scatter_px
+        RMS departure from the polynomial across the lines, px.
+    """
+
+    along: Array
+    scatter_px: float
+
+
+def fit_lines(ij: Indices, xy: Array) -> LineFit:
+    """Fit the directions of lines at all places on them, and how far they are from even distances.
 
     The part of a residual along a line is not known, and may be some pixels. Directions from neighbours alone are off
     by thousandths, which would turn it into hundredths of a pixel across, as if it were known.
@@ -143,10 +159,6 @@ def fit_directions(ij: Indices, xy: Array) -> Array:
     ----------
     ij, xy
         (n, 2) number of the line and of the place, and positions, px.
-
-    Returns
-    -------
-    (n, 2) unit vectors towards growing j.
     """
     middle, scale = ij.mean(axis=0), np.maximum(0.5 * np.ptp(ij, axis=0), 1.0)
     u, v = ((ij - middle) / scale).T
@@ -155,8 +167,12 @@ def fit_directions(ij: Indices, xy: Array) -> Array:
     powers = [(a, n - a) for n in range(most + 1) for a in range(n + 1)]
     basis = np.stack([u**a * v**b for a, b in powers], axis=1)
     slope = np.stack([b * u**a * v ** max(b - 1, 0) for a, b in powers], axis=1)
-    along = slope @ np.linalg.lstsq(basis, xy, rcond=None)[0]
-    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
+    terms = np.linalg.lstsq(basis, xy, rcond=None)[0]
+    along = slope @ terms
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    left = xy - basis @ terms
+    across = left[:, 0] * along[:, 1] - left[:, 1] * along[:, 0]
+    return LineFit(along, float(np.sqrt(np.mean(across**2))))
 
 
 def _find_wave(image: Image, octave: int) -> _Wave | None:

@@ -90,6 +90,17 @@ def test_what_repeats_in_two_directions_is_no_grating(board: Board) -> None:
     assert found.status is LatticeStatus.OTHER_PATTERN
 
 
+def test_lines_at_uneven_distances_are_refused() -> None:
+    x = np.arange(240.0)
+    uneven = np.array([0.0, 1.7, -1.4, 1.2, -1.6, 1.3, -0.9, 1.5, -1.7, 0.6])
+    places = 12.0 + 24.0 * np.arange(10.0) + uneven
+    profile = np.exp(-0.5 * ((x - places[:, None]) / 5.0) ** 2).sum(axis=0)
+    noise = np.random.default_rng(0).normal(0.0, 4.0, (200, 240))
+    found = find_lattice(60.0 + 100.0 * np.tile(profile, (200, 1)) + noise, pattern="grating")
+    assert isinstance(found, Rejection)
+    assert "even distances" in found.reason
+
+
 def test_texture_is_no_grating() -> None:
     texture = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(240, 320)), (0, 0), 3.0)
     found = find_lattice(texture, pattern="grating")
