@@ -85,6 +85,20 @@ def update(distro: str, this_python: bool) -> None:
         print("Installing semcal_ros into .venv.", flush=True)
         pip("--no-deps", "--no-build-isolation", "--editable", str(ROOT))
         write_stamp({**stamp, "package": package})
+    add_ament_index()
+
+
+def add_ament_index() -> None:
+    """Let every Python of .venv find the packages in it, as the setup script of a ROS installation does.
+
+    Launch files, ``get_package_share_directory`` and the user's own scripts look the packages up by this variable.
+    """
+    line = (
+        "import os, sys; os.environ['AMENT_PREFIX_PATH'] = os.pathsep.join([sys.prefix, *(p for p in "
+        "os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p not in ('', sys.prefix))])\n"
+    )
+    for folder in VENV.glob("lib/python*/site-packages"):
+        (folder / "semcal_ament_index.pth").write_text(line, encoding="ascii")
 
 
 def select(distro: str) -> None:

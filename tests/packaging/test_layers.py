@@ -53,8 +53,8 @@ THIRD_PARTY = {
     "applications": {"numpy", "scipy", "cv2"},
     "bridge": {"numpy", "scipy", "cv2"},
 }
-# The places of ROS: the nodes, and the one module of the doctor that listens.
-ROS_PLACES = (PACKAGE / "nodes", PACKAGE / "doctor" / "live.py")
+# The places of ROS: the nodes, and the modules of doctor and client that listen.
+ROS_PLACES = (PACKAGE / "nodes", PACKAGE / "doctor" / "live.py", PACKAGE / "client" / "stream.py")
 # Files, clocks, processes and logging have no place in core.
 NOT_IN_CORE = {
     "asyncio",

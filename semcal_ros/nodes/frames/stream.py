@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -166,7 +166,7 @@ class FrameInput:
     def __init__(
         self,
         config: MicroscopeConfig,
-        parameters: Parameters,
+        parameters: Parameters | Mapping[str, Any],
         endpoints: Endpoints,
         reporter: Reporter,
         on_frame: Callable[[StreamFrame], None],
