@@ -87,6 +87,8 @@ _NEGLIGIBLE = 1e-2
 _LARGEST_TURN = 0.5
 # Damping that makes up for what rounding takes from the equations: it changes no sigma in the first five digits.
 _ROUNDING = 1e-10
+# Decrease of half chi-square in a step that changes nothing: it moves an unknown by 0.004 of its sigma.
+_NOTHING = 1e-5
 # Relative decrease of the cost below which another step cannot matter to the result.
 _COST_TOLERANCE = 1e-7
 
@@ -143,8 +145,14 @@ class BundleResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the cost is at a minimum, and every point has a projection there."""
+        """Whether the cost is at a minimum, and every point has a projection there.
+
+        A descent along a flat valley may take more steps than there are, each of which changes next to nothing; the
+        certificate then says how far it still is from the end.
+        """
         ended = self.status in (DescentStatus.SMALL_DECREASE, DescentStatus.NO_DESCENT)
+        slow = self.status is DescentStatus.ITERATION_LIMIT
+        ended |= slow and 0.0 < self.last_decrease * self.cost < _NOTHING
         return ended and not np.any(self.lost)
 
     @property
