@@ -126,6 +126,12 @@ def test_the_tracker_prints_where_the_bead_is(sweep: Path) -> None:
         assert max(sx, sy) < 0.02 * 1e9 * make_calibration().at(g).pixel_size_m[0] * SIZE
 
 
+def test_the_readme_shows_the_tracker() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    second = readme.split("\n## ")[2]
+    assert listing("import rclpy").strip() in re.sub(r"^    ", "", second, flags=re.MULTILINE)
+
+
 def test_the_same_without_ros(sweep: Path) -> None:
     code = "import sys; sys.modules['rclpy'] = None\n" + listing(
         "from semcal_ros.client import open_frames"
