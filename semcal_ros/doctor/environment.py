@@ -33,7 +33,11 @@ __all__ = ["collect_environment"]
 
 _MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
 # Importing rclpy loads the middleware, which may end the process at once: a separate process does it.
-_PROBE = "import rclpy; print(rclpy.__file__); print(rclpy.get_rmw_implementation_identifier())"
+_PREFIXES = "AMENT_PREFIX_PATH"
+_PROBE = (
+    f"import os, rclpy; print(os.environ.get('{_PREFIXES}', '')); print(rclpy.__file__); "
+    "print(rclpy.get_rmw_implementation_identifier())"
+)
 _PROBE_S = 60.0  # importing rclpy takes about a second; this only ends a process that hangs
 _LONGEST = 200  # characters of a reason, which must fit on one line
 _RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
@@ -43,7 +47,7 @@ _INSTALLATIONS = Path("/opt/ros")
 
 def collect_environment() -> Environment:
     """Collect the state of this machine and process, without a ROS graph; imports what the nodes import."""
-    rclpy_file, rmw, reason = _probe_ros()
+    rclpy_file, rmw, script_prefixes, reason = _probe_ros()
     distributions = [found for found in metadata.distributions() if found.metadata["Name"]]
     errors = {"rclpy": reason} if reason else _import_errors(_MESSAGES)
     return Environment(
@@ -55,26 +59,33 @@ def collect_environment() -> Environment:
         prefix=sys.prefix,
         installations=tuple(sorted(str(p.parent) for p in _INSTALLATIONS.glob("*/setup.sh"))),
         environment=dict(os.environ),
+        script_prefixes=tuple(p for p in script_prefixes.split(os.pathsep) if p),
         rmw=rmw,
         shm_free_bytes=shutil.disk_usage(_SHM).free if _SHM.is_dir() else None,
         receive_buffer_bytes=_number_in(_RECEIVE_BUFFER),
     )
 
 
-def _probe_ros() -> tuple[str, str, str]:
-    """File of rclpy, name of the middleware, and, where rclpy cannot be imported, the reason."""
+def _probe_ros() -> tuple[str, str, str, str]:
+    """File of rclpy, name of the middleware, where scripts look packages up, and, where rclpy cannot be imported, the
+    reason.
+    """
+    # This command has put its own prefix there, which a script of the user's does not do.
+    prefixes = os.environ.get(_PREFIXES, "").split(os.pathsep)
+    outer = {**os.environ, _PREFIXES: os.pathsep.join(p for p in prefixes if p != sys.prefix)}
     command = [sys.executable, "-W", "ignore", "-c", _PROBE]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=_PROBE_S
+            command, capture_output=True, text=True, check=False, timeout=_PROBE_S, env=outer
         )
     except subprocess.TimeoutExpired:
-        return "", "", f"importing it took over {_PROBE_S:g} s"
+        return "", "", "", f"importing it took over {_PROBE_S:g} s"
     lines = done.stdout.split("\n")
-    if done.returncode == 0 and len(lines) >= 3:
-        return lines[-3], lines[-2], ""
+    if done.returncode == 0 and len(lines) >= 4:
+        return lines[-3], lines[-2], lines[-4], ""
     said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-    return "", "", said[-1][:_LONGEST] if said else f"the process ended with {done.returncode}"
+    reason = said[-1][:_LONGEST] if said else f"the process ended with {done.returncode}"
+    return "", "", "", reason
 
 
 def _import_errors(modules: Iterable[str]) -> dict[str, str]:

@@ -38,6 +38,7 @@ __all__ = [
     "check_discovery",
     "check_domain",
     "check_one_ros",
+    "check_package_index",
     "check_packages",
     "check_profile",
     "check_python",
@@ -172,6 +173,26 @@ def check_one_ros(seen: Environment) -> list[Finding]:
             )
         ]
     return [ok("ROS 2 wheels", f"ros-rclpy {rclpy}")]
+
+
+def check_package_index(seen: Environment) -> list[Finding]:
+    """Check whether scripts and launch files of the user find the packages of this environment."""
+    if "ros-rclpy" not in seen.packages or not seen.rclpy_file:
+        return []
+    if seen.prefix in seen.script_prefixes:
+        return [
+            ok("package index", f"scripts look packages up in {', '.join(seen.script_prefixes)}")
+        ]
+    listed = ", ".join(seen.script_prefixes) or "empty"
+    return [
+        problem(
+            "package index",
+            f"AMENT_PREFIX_PATH is {listed} for a script, so that get_package_share_directory and launch find nothing "
+            "of this environment",
+            expected=f"{seen.prefix} in it",
+            do=f"`export AMENT_PREFIX_PATH={seen.prefix}`; `make setup` does that for its own environment",
+        )
+    ]
 
 
 def _wrong_middleware(seen: Environment) -> bool:
@@ -358,6 +379,7 @@ ENVIRONMENT_CHECKS: tuple[Callable[[Environment], list[Finding]], ...] = (
     check_packages,
     check_rclpy,
     check_one_ros,
+    check_package_index,
     check_rmw,
     check_domain,
     check_discovery,

@@ -70,6 +70,8 @@ class Environment:
         ROS installations of this machine, such as ``/opt/ros/jazzy``.
     environment
         Environment variables.
+    script_prefixes
+        Prefixes in which a script of the user's looks packages up (``AMENT_PREFIX_PATH``); empty without rclpy.
     rmw
         The middleware in use; empty without rclpy.
     shm_free_bytes
@@ -86,6 +88,7 @@ class Environment:
     prefix: str
     installations: tuple[str, ...]
     environment: Mapping[str, str]
+    script_prefixes: tuple[str, ...]
     rmw: str
     shm_free_bytes: int | None
     receive_buffer_bytes: int | None

@@ -87,6 +87,7 @@ AROUND = Environment(
     prefix="/venv",
     installations=(),
     environment={"AMENT_PREFIX_PATH": "/venv"},
+    script_prefixes=("/venv",),
     rmw="rmw_fastrtps_cpp",
     shm_free_bytes=64 * MIB,
     receive_buffer_bytes=64 * MIB,
@@ -186,6 +187,17 @@ def test_wheels_are_of_one_distribution_and_alone() -> None:
     sourced = with_environment(AMENT_PREFIX_PATH="/venv:/opt/ros/jazzy")
     only(checks.check_one_ros(sourced), NOTE, "/opt/ros/jazzy")
     assert checks.check_one_ros(around(packages={})) == []
+
+
+def test_scripts_find_the_packages_of_the_environment() -> None:
+    only(checks.check_package_index(around()), OK, "/venv")
+    for prefixes in ((), ("/opt/ros/jazzy",)):
+        found = checks.check_package_index(around(script_prefixes=prefixes))
+        only(
+            found, PROBLEM, "get_package_share_directory", "/venv in it", "export AMENT_PREFIX_PATH"
+        )
+    # A workspace that was sourced has its own.
+    assert checks.check_package_index(around(packages={})) == []
 
 
 def test_middleware() -> None:
