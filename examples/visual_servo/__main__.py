@@ -23,9 +23,10 @@
 4. The same for five seeds (--seeds), each with a calibration, a rough charging target and a drift of its own: median
    and worst.
 
-    python -m examples.visual_servo [--quick] [--live | --replay | --plants 10] [--seeds 5] [--preset jsm820]
+    python -m examples.visual_servo [--quick] [--live [--tip] | --replay | --plants 10] [--seeds 5] [--preset jsm820]
 
 With --live the nodes do it as processes of their own: virtual_sem, parameter_server, stream_corrector, visual_servo.
+With --tip a tip then enters the picture at each magnification, to a third of it, and the servo has to hold the target.
 It fails (exit status 1) where a preset with distortion that the parameters do not describe got no residual field, and
 where the servo does not converge at a magnification.
 With --replay the frames of the continuous case then become a recording, which bag_player replays to the nodes: what
@@ -250,6 +251,9 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer and smaller frames")
     parser.add_argument("--live", action="store_true", help="the nodes, over ROS")
     parser.add_argument(
+        "--tip", action="store_true", help="live: a tip enters the picture at each magnification"
+    )
+    parser.add_argument(
         "--replay", action="store_true", help="the recording then replayed to the nodes"
     )
     parser.add_argument(
@@ -295,7 +299,9 @@ def main() -> int:
             )
             return 1
         print("with a residual field" if has_field else "without a residual field", flush=True)
-        run, missed = live(options.output, scope, *chosen, GOAL, travel_m, magnifications)
+        run, missed = live(
+            options.output, scope, *chosen, GOAL, travel_m, magnifications, with_tip=options.tip
+        )
         last = np.array(run.true_px)[np.array(run.magnification) == magnifications[-1]][-LAST:]
         if last.size:
             rms_px = float(np.sqrt(np.mean(last**2)))

@@ -28,6 +28,8 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -55,6 +57,8 @@ START_S, STAGE_S, DRIVE_S = 60.0, 90.0, 2.0
 HELD = 6
 # Frames after a change of the magnification that are waited for first.
 CHANGING = 6
+# How far a tip comes in, as parts of the field's width, and frames at each place.
+TIP, TIP_FRAMES = (0.08, 0.16, 0.24, 0.32), 3
 
 
 class Suite:
@@ -95,6 +99,7 @@ class Suite:
         ]
         self.stage = self._node.create_publisher(Twist, "virtual_sem/stage", queue)
         self._start = self._node.create_client(Trigger, "visual_servo/start")
+        self._set = self._node.create_client(SetParameters, "virtual_sem/set_parameters")
         self.knob = self._node.create_publisher(Float64, "virtual_sem/set_magnification", queue)
 
     def _on_image(self, message: Image) -> None:
@@ -138,6 +143,14 @@ class Suite:
         answer = self._start.call_async(Trigger.Request())
         self.spin_until(answer.done, START_S)
 
+    def set_tip(self, part: float) -> None:
+        """Let a tip cover so much of the field from now on."""
+        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=part)
+        request = SetParameters.Request(parameters=[Parameter(name="tip", value=value)])
+        answer = self._set.call_async(request)
+        if not self.spin_until(answer.done, START_S) or not answer.result().results[0].successful:
+            raise RuntimeError("virtual_sem did not take the tip")
+
     def converged_at(self, g: float) -> bool:
         """Whether the servo itself says so, of frames of that magnification."""
         servo, corrector = (self.states.get(n, {}) for n in ("visual_servo", "stream_corrector"))
@@ -154,9 +167,12 @@ def live(
     goal: PlanePose,
     travel_m: tuple[float, float],
     magnifications: list[float],
+    *,
+    with_tip: bool = False,
 ) -> tuple[Run, list[float]]:
     """Servo with the nodes through all magnifications: the truth of every frame that was heard, and the magnifications
-    at which the servo did not converge.
+    at which the servo did not converge. ``with_tip`` lets a tip enter the field from the left, to a third of it, at
+    each of them.
     """
     run, missed = Run("live nodes"), []
     suite = Suite(folder, preset, drift, seed, goal)
@@ -168,6 +184,14 @@ def live(
             # What is told right after the change may be of the frames before it.
             suite.spin_until(lambda count=first + CHANGING: len(suite.images) >= count, STAGE_S)
             reached = suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
+            if with_tip:
+                for part in TIP:
+                    suite.set_tip(part)
+                    count = len(suite.images) + TIP_FRAMES
+                    suite.spin_until(lambda count=count: len(suite.images) >= count, STAGE_S)
+                share = float(suite.states["stream_corrector"].get("drift_moving_share", "nan"))
+                # It holds what it has, with the tip in the picture.
+                reached &= suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
             if not reached:
                 missed.append(g)
             frames = len(suite.images) - first
@@ -178,9 +202,12 @@ def live(
             print(
                 f"{g:6g}x {'converged' if reached else 'NOT converged'} after {frames:2} frames,"
                 f" {time.monotonic() - began:4.0f} s; own error {float(own['servo_error_px']):.3f} px;"
-                f" truth {run.true_px[-1]:.3f} px, {1e9 * run.true_m()[-1]:.1f} nm; resets {own['servo_resets']}",
+                f" truth {run.true_px[-1]:.3f} px, {1e9 * run.true_m()[-1]:.1f} nm; resets {own['servo_resets']}"
+                + (f"; tip left out of {100.0 * share:.0f} % of the field" if with_tip else ""),
                 flush=True,
             )
+            if with_tip:
+                suite.set_tip(0.0)
     finally:
         suite.close()
     (folder / "live.json").write_text(

@@ -201,6 +201,9 @@ _PARAMETERS = (
         fixed=True,
     ),
     ParameterDeclaration(
+        "tip", 0.0, "Part of the field's width that a tip from the left covers.", "", 0.0, 1.0
+    ),
+    ParameterDeclaration(
         "grid_extent", 0, "Squares a side of the grid; 0: endless.", "", 0, 100_000, fixed=True
     ),
     ParameterDeclaration(
@@ -246,6 +249,8 @@ class VirtualSem(SemNode):
         for name in _POSE:
             self.parameters.on_change(name, self._set_pose)
         self.parameters.on_change("bits", self._set_bits, self._detector)
+        self._set_tip(self.parameters["tip"])
+        self.parameters.on_change("tip", self._set_tip)
         self.parameters.on_change("rate", self._set_rate)
         source = self._checked_source()
         self._images = self.endpoints.stream_publisher(Image, self.config.image.topic)
@@ -366,6 +371,9 @@ class VirtualSem(SemNode):
 
     def _set_bits(self, bits: int) -> None:
         self._scene.set_detector(bits=bits)
+
+    def _set_tip(self, part: float) -> None:
+        self._scene.set_detector(tip=part)
 
     def _set_rate(self, _value: float) -> None:
         self._timer.timer_period_ns = round(self._period_s() * 1e9)

@@ -40,6 +40,24 @@ _REACH = 4
 _POISSON_LIMIT = 200.0
 
 
+# Corners of a tip from the left, as parts of its reach and of the height of the field.
+_TIP = np.array([(-1.0, 0.15), (1.0, 0.46), (1.0, 0.54), (-1.0, 0.9)])
+# Its reflectivity, and that of the ridges along it.
+_TIP_LEVEL, _TIP_RIDGES, _RIDGE_PX = 0.85, 0.1, 9.0
+
+
+def _cover(reflectivity: Image, part: float) -> Image:
+    """What is seen where a tip is in front of the specimen."""
+    height, width = reflectivity.shape
+    corners = np.rint(16.0 * _TIP * [part * width, height]).astype(np.int32)
+    mask = np.zeros(reflectivity.shape, dtype=np.uint8)
+    cv2.fillPoly(mask, [corners], 255, cv2.LINE_AA, 4)
+    shown = mask.astype(np.float32) / np.float32(255.0)
+    rows = np.arange(height, dtype=np.float32)[:, None] / np.float32(_RIDGE_PX)
+    tip = np.float32(_TIP_LEVEL) + np.float32(_TIP_RIDGES) * np.sin(rows)
+    return np.asarray(reflectivity * (1.0 - shown) + tip * shown, dtype=np.float32)
+
+
 @dataclass(frozen=True)
 class Detector:
     """Image formation after the scan.
@@ -72,6 +90,8 @@ class Detector:
         8 or 16.
     databar_rows
         Rows of a data bar that are appended below the scanned field.
+    tip
+        Part of the field's width that a bright tip from the left covers where it reaches farthest; 0 for none.
     """
 
     blur_px: float = 0.8
@@ -86,6 +106,7 @@ class Detector:
     bits: int = 8
     databar_rows: int = 0
     line_jitter_px: float = 0.0
+    tip: float = 0.0
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
@@ -95,6 +116,10 @@ class Detector:
                 f"detector {self}", expected="no negative blur, dose, noise or rows"
             )
 
+        if not 0.0 <= self.tip <= 1.0:
+            raise InvalidValueError(
+                f"a tip over {self.tip:g} of the field", expected="a part of it, 0 to 1"
+            )
         if not 0.0 <= self.line_jitter_px <= _LARGEST_JITTER_PX:
             raise InvalidValueError(
                 f"a line jitter of {self.line_jitter_px:g} px",
@@ -113,6 +138,8 @@ class Detector:
         -------
         (h + databar_rows, w) uint8 or uint16.
         """
+        if self.tip > 0.0:
+            reflectivity = _cover(reflectivity, self.tip)
         signal = self._spot(reflectivity)
         if self.line_jitter_px > 0:
             shifts = self.line_jitter_px * rng.standard_normal(len(signal))

@@ -131,6 +131,19 @@ def test_blur_keeps_the_mean_and_reaches_over_the_border() -> None:
     assert steps.max() == pytest.approx(height / (2 * math.sqrt(2 * math.pi)), rel=0.05)
 
 
+@pytest.mark.parametrize("part", [0.1, 0.5])
+def test_a_tip_covers_the_field_from_the_left_as_far_as_it_says(part: float) -> None:
+    bare, covered = flat_image(PLAIN), flat_image(replace(PLAIN, tip=part))
+    changed = np.abs(covered - bare) > 0.05 * 65535
+    height, width = changed.shape
+    reach = np.flatnonzero(changed[height // 2])
+    assert reach.min() == 0
+    assert abs(reach.max() - part * width) < 2.0
+    assert not changed[:, int(part * width) + 2 :].any()
+    with pytest.raises(InvalidValueError, match="part of it"):
+        replace(PLAIN, tip=1.5)
+
+
 def test_databar_is_appended_below_the_field() -> None:
     plain = render_frame(preset("jsm820"), ChessGrid(5e-6), Pose.flat(), 2000.0)
     with_bar = render_frame(
