@@ -548,6 +548,7 @@ class DriftTracker:
             image_region=region,
             max_shear_px=_MAX_SHEAR * frame.size[1],
             apart=track.apart,
+            takes_lines=True,
         )
         if registration.rejection is not None:
             return _RejectedMatch(registration.rejection, registration)

@@ -355,6 +355,7 @@ def register(
     image_region: Region | None = None,
     max_shear_px: float = 0.0,
     apart: bool = False,
+    takes_lines: bool = False,
 ) -> Registration:
     """Measure the shift of ``image`` against a prepared reference.
 
@@ -375,6 +376,9 @@ def register(
     apart
         Whether something in the image is expected to move apart from the specimen, as in the image before. It is
         found without, which takes twice as long.
+    takes_lines
+        Whether a shift across lines is of use, with the predicted one along them (:attr:`Registration.along`). It is
+        measured only where there is a covariance of the prediction.
 
     Returns
     -------
@@ -397,12 +401,19 @@ def register(
     )
     if reference.defect or guess_covariance is None or reference.lines is None:
         return found
+    # A shift along lines may be one of noise.
     if found.accepted and _is_seen_along(reference, reference.lines, image, image_region, found):
         return found
-    across = _register_across(
-        reference, reference.lines, image, guess_px, guess_covariance, image_region
-    )
-    return across if across.accepted else found
+    if takes_lines:
+        across = _register_across(
+            reference, reference.lines, image, guess_px, guess_covariance, image_region
+        )
+        if across.accepted:
+            return across
+    if not found.accepted:
+        return found
+    reason = "one direction is not determined: it shows lines, and fits as well farther along them"
+    return replace(found, rejection=Rejection(MatchFailure.UNDETERMINED, reason))
 
 
 def _is_seen_along(

@@ -105,10 +105,16 @@ def test_lines_at_equal_distances_are_refused() -> None:
         frames[1],
         guess_px=(0.0, 0.0),
         guess_covariance=np.eye(2) * 100.0,
+        takes_lines=True,
     )
     assert not found.accepted
 
 
-def test_without_a_prediction_lines_are_refused() -> None:
-    frames, _ = scratched(2)
-    assert not register(prepare_reference(frames[0]), frames[1]).accepted
+def test_lines_are_refused_without_a_prediction_and_where_nobody_takes_them() -> None:
+    frames, drift = scratched(24)
+    reference, spread = prepare_reference(frames[0]), 9.0 * np.eye(2)
+    assert not register(reference, frames[1], takes_lines=True).accepted
+    for frame, moved in zip(frames[1:], drift[1:], strict=True):
+        found = register(reference, frame, guess_px=moved, guess_covariance=spread)
+        assert not found.accepted
+        assert found.along is None
