@@ -120,7 +120,8 @@ def test_the_pattern_of_most_views_is_that_of_the_grid():
     found, rejected = find_views(frames, processes=1, pattern="chess")
     assert [v.name for v in found] == ["2"]
     with pytest.raises(
-        CalibrationError, match=r"dots, not a chess board, by odds of.*--pattern auto"
+        CalibrationError,
+        match=r"dots, not a chess board, by odds of.*set --pattern to what is seen",
     ):
         collect_views([], rejected, display_width_m=0.12, squares_m=[8e-6])
 

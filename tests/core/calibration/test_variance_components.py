@@ -38,6 +38,7 @@ class _Effects:
 class _Problem:
     effects: _Effects
     unit_m: Array
+    across: None = None
 
 
 @dataclass(frozen=True)
