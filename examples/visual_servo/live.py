@@ -197,12 +197,17 @@ def live(
             frames = len(suite.images) - first
             held = len(suite.images) + HELD
             suite.spin_until(lambda count=held: len(suite.images) >= count, STAGE_S)
-            _judged(run, suite, microscope, goal, g, first)
+            seen = _judged(run, suite, microscope, goal, g, first)
             own = suite.states.get("visual_servo", {})
             print(
                 f"{g:6g}x {'converged' if reached else 'NOT converged'} after {frames:2} frames,"
                 f" {time.monotonic() - began:4.0f} s; own error {float(own['servo_error_px']):.3f} px;"
-                f" truth {run.true_px[-1]:.3f} px, {1e9 * run.true_m()[-1]:.1f} nm; resets {own['servo_resets']}"
+                + (
+                    f" truth {run.true_px[-1]:.3f} px, {1e9 * run.true_m()[-1]:.1f} nm"
+                    if any(seen[-HELD:])
+                    else f" truth not seen in the last {HELD} frames"
+                )
+                + f"; resets {own['servo_resets']}"
                 + (f"; tip left out of {100.0 * share:.0f} % of the field" if with_tip else ""),
                 flush=True,
             )
@@ -218,21 +223,27 @@ def live(
 
 def _judged(
     run: Run, suite: Suite, microscope: VirtualMicroscope, goal: PlanePose, g: float, first: int
-) -> None:
-    """Where the target was in the frames since the last change, by the true microscope; mixed frames fail."""
+) -> list[bool]:
+    """Where the target was in the frames since the last change, by the true microscope; mixed frames fail.
+
+    Returns whether each of these frames showed it.
+    """
     camera = microscope.camera_at(g)
+    seen = []
     rectifier, plane = Rectifier("cubic"), PlaneCamera.from_camera(camera)
     for stamp in list(suite.images)[first:]:
         image = suite.images[stamp]
         view = find_target(rectifier.rectify(image, camera), NestedTarget())
         fit = fit_pose(without_residual(view, microscope, g), plane)
-        if not fit.accepted or abs(fit.scale - 1.0) > 0.02:
+        seen.append(fit.accepted and abs(fit.scale - 1.0) <= 0.02)
+        if not seen[-1]:
             continue
         error = fit.pose.minus(goal)
         run.magnification.append(g)
         run.true_error.append(error)
         run.true_px.append(float(np.hypot(*(camera.ideal_from_sem_jacobian @ error[:2]))))
         run.images[g] = image
+    return seen
 
 
 def without_residual(view: TargetView, microscope: VirtualMicroscope, g: float) -> TargetView:
