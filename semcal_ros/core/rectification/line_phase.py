@@ -25,8 +25,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array32
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Array32
 
 __all__ = ["LinePhase", "LinePhaseCorrector", "estimate_line_phase", "remove_line_phase"]
 
@@ -40,6 +41,12 @@ _SMOOTH_PX = 1.0
 _STEPS, _ENOUGH = 6, 0.1
 # Groups of lines from whose scatter the sigma is told, to a sixth.
 _GROUPS = 16
+# Structure along the lines is there where neighbours have in common more than this many sigmas, which the best of all
+# shifts of noise has once in a million.
+_STRUCTURE_SIGMAS = 6.0
+# What repeats: another peak of the correlation at least so high, and a valley before it at most so, as parts of the
+# highest; and the part of the period below which the phase is taken to be.
+_AS_HIGH, _VALLEY, _OF_PERIOD = 0.8, 0.5, 0.25
 # A phase is there where it is more than this many sigmas, which chance makes once in a million looks, and this many px.
 _SIGMAS, _LEAST_PX = 5.0, 0.1
 # Lobes of the Lanczos filter that moves lines, to each side.
@@ -73,9 +80,9 @@ class LinePhase:
 def estimate_line_phase(image: AnyImage) -> LinePhase:
     """Estimate the phase from one image, by lines against the mean of their neighbours.
 
-    Edges at any slant have the same mean in the neighbours as in the line between them. It fails, with a large sigma,
-    on images without structure along the lines, and is wrong by a period where something of a period below twice the
-    phase runs across all lines.
+    Edges at any slant have the same mean in the neighbours as in the line between them. It fails, with an infinite
+    sigma, on images without structure along the lines, and on what repeats along all of them, unless the phase nearest
+    to zero is below a quarter of the period. Then that one is taken, and one above three quarters is mistaken for it.
 
     Parameters
     ----------
@@ -94,7 +101,10 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
     spectrum, other = np.fft.rfft(line * window), np.fft.rfft(mean * window)
     correlation = np.fft.irfft(np.sum(spectrum * np.conj(other), axis=0), width)
     lags = np.arange(-largest, largest + 1)
-    shift = float(lags[np.argmax(correlation[lags])])
+    chosen = _choose_lag(correlation[lags], lags)
+    if chosen is None:
+        return LinePhase(0.0, np.inf)
+    shift = float(chosen)
     frequency = np.asarray(2j * np.pi * np.fft.rfftfreq(width), dtype=np.complex64)
     margin = slice(largest + 2, width - largest - 2)
     groups = np.arange(len(first)) * min(_GROUPS, len(first)) // len(first)
@@ -106,18 +116,43 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
         moved = whole * np.exp(frequency * np.float32(shift))
         left = (np.fft.irfft(moved, width) - mean)[:, margin]
         slope = np.fft.irfft(moved * frequency, width)[:, margin]
-        scores, total = np.sum(slope * left, axis=1), float(np.sum(slope * fixed))
-        if total <= 0.0:
+        scores, common = np.sum(slope * left, axis=1), np.sum(slope * fixed, axis=1)
+        total = float(common.sum())
+        if total <= _STRUCTURE_SIGMAS * _scatter(common, groups):
             return LinePhase(0.0, np.inf)
         step = float(scores.sum()) / total
         shift -= step
-        spread = np.bincount(groups, weights=scores)
-        sigma = float(np.std(spread, ddof=1) * np.sqrt(len(spread))) / total
+        sigma = _scatter(scores, groups) / total
         if abs(shift) > largest:
             return LinePhase(0.0, np.inf)
         if abs(step) < _ENOUGH * sigma:
             break
     return LinePhase(shift, sigma)
+
+
+def _choose_lag(correlation: Array, lags: NDArray[np.int_]) -> int | None:
+    """The highest peak of the correlation; of several that are as high, the one nearest to zero if near enough."""
+    top = int(np.argmax(correlation))
+    highest = float(correlation[top])
+    inner = correlation[1:-1]
+    is_peak = (
+        (inner >= correlation[:-2]) & (inner >= correlation[2:]) & (inner > _AS_HIGH * highest)
+    )
+    rivals = [top]
+    for k in (np.flatnonzero(is_peak) + 1).tolist():
+        between = correlation[min(k, top) : max(k, top) + 1]
+        if float(between.min()) < _VALLEY * highest:
+            rivals.append(k)
+    rivals.sort(key=lambda k: abs(int(lags[k])))
+    nearest = int(lags[rivals[0]])
+    period = min((abs(int(lags[k]) - nearest) for k in rivals[1:]), default=0)
+    return None if len(rivals) > 1 and abs(nearest) >= _OF_PERIOD * period else nearest
+
+
+def _scatter(values: Array, groups: NDArray[np.int_]) -> float:
+    """1-sigma of the sum of values of single lines, from that of the sums of groups of them."""
+    sums = np.bincount(groups, weights=values)
+    return float(np.std(sums, ddof=1) * np.sqrt(len(sums)))
 
 
 def _prepare(lines: AnyImage) -> Array32:
@@ -185,7 +220,9 @@ class LinePhaseCorrector:
 
     @property
     def note(self) -> str:
-        """The phase that was removed, or that nobody declared; empty if there is none."""
+        """The phase that was removed, or that nobody declared, or that is not known; empty if there is none."""
+        if self.declared and self._frames and not np.isfinite(self.phase.sigma_px):
+            return "these pictures do not tell by how much odd lines are shifted against even ones: they were not moved"
         if not self.phase.is_seen:
             return ""
         size = f"{self.phase.shift_px:.2f} +- {self.phase.sigma_px:.1g} px"

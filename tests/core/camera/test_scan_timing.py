@@ -50,6 +50,9 @@ def test_odd_lines_of_a_bidirectional_scan_begin_at_the_other_end() -> None:
     # Lines of 0.1 s: a tenth of the way along an even one, and nine tenths along an odd one.
     assert timing.pixel_offset_s(2, 4, 8, 40) == pytest.approx(0.21)
     assert timing.pixel_offset_s(3, 4, 8, 40) == pytest.approx(0.39)
+    # Between two lines, their time is interpolated, as their pixels are.
+    assert timing.pixel_offset_s(2.25, 4, 8, 40) == pytest.approx(0.255)
+    assert timing.pixel_offset_s(3.5, 4, 8, 40) == pytest.approx(0.5 * (0.39 + 0.41))
 
 
 def test_a_recursive_average_is_as_old_as_its_weights_say() -> None:

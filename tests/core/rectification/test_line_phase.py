@@ -79,6 +79,24 @@ def test_none_is_seen_where_there_is_none(name: str) -> None:
     assert not estimate_line_phase(noisy_scene(name)).is_seen
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_stripes_along_the_lines_tell_none(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stripes = 100.0 + 40.0 * np.sign(rng.normal(size=(256, 1))) * np.ones(256)
+    assert not np.isfinite(estimate_line_phase(rng.normal(stripes, 8.0)).sigma_px)
+
+
+def test_of_what_repeats_only_the_phase_below_a_quarter_of_the_period_is_told() -> None:
+    x, rng = np.arange(256), np.random.default_rng(0)
+    grating = 100.0 + 50.0 * np.sin(2.0 * np.pi * x / 8.0) * np.ones((256, 1))
+    told = estimate_line_phase(rng.normal(shifted(grating, 1.3), 8.0))
+    assert abs(told.shift_px - 1.3) < 4.0 * told.sigma_px < 0.1
+    for phase in (3.0, -2.7, 4.0):
+        lines, frame = LinePhaseCorrector(True), rng.normal(shifted(grating, phase), 8.0)
+        assert lines.correct(frame) is frame
+        assert "were not moved" in lines.note
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_lines_are_moved_back_by_half_each(dtype: type) -> None:
     x = np.arange(200.0)

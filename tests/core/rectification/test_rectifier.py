@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -105,16 +107,20 @@ def test_averaged_scans_shear_by_one_pass_only() -> None:
     assert middle[0, 0] == pytest.approx(SIZE / 2, abs=0.01)
 
 
+@pytest.mark.parametrize("bidirectional", [False, True])
 @pytest.mark.parametrize("rows_per_row", [0.001, 0.03, 0.4])
-def test_raw_positions_fulfil_their_equation_however_fast_the_drift_is(rows_per_row: float) -> None:
+def test_raw_positions_fulfil_their_equation_however_fast_the_drift_is(
+    rows_per_row: float, bidirectional: bool
+) -> None:
     # Steps are left out where those before tell that they would change nothing.
-    speed_m_s = rows_per_row * SIZE / TIMING.frame_time_s / CAMERA.m
+    timing = replace(TIMING, bidirectional=bidirectional)
+    speed_m_s = rows_per_row * SIZE / timing.frame_time_s / CAMERA.m
     drift = RasterDrift(
         np.array([4e-6, -7e-6]), speed_m_s * np.array([0.6, -0.8]), speed_m_s * np.array([0.2, 0.1])
     )
     xy = _grid(9, 9) * 20.0 + 10.0
-    raw = raw_from_output(xy, (SIZE, SIZE), CAMERA, drift, TIMING)
-    moved = PixelDrift((SIZE, SIZE), CAMERA, drift, TIMING).moved(xy, raw)
+    raw = raw_from_output(xy, (SIZE, SIZE), CAMERA, drift, timing)
+    moved = PixelDrift((SIZE, SIZE), CAMERA, drift, timing).moved(xy, raw)
     # A hundredth of what is promised for maps, and what the last step leaves.
     np.testing.assert_allclose(CAMERA.raw_from_rect(moved), raw, atol=2e-5)
 
