@@ -338,6 +338,7 @@ KINDS: dict[str, Kind] = {
     "spots and cross-hair": Kind(gold, spots),
     "tool over sparse from the start": Kind(sparse, tool_from_start, determined=False),
     "scratches": Kind(scratches, determined=False),
+    "tool over scratches": Kind(scratches, tool, determined=False),
     "perfect lattice": Kind(lambda rng: lattice(rng, 0), determined=False),
     "perfect lattice, jump": Kind(lambda rng: lattice(rng, 0), jump_px=9.0, determined=False),
     "noise": Kind(flat, determined=False),

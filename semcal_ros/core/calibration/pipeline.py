@@ -45,7 +45,10 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_factor
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup, build_problem
-from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
+from semcal_ros.core.calibration.estimator.residual_field_fit import (
+    ENOUGH_MAGNIFICATIONS,
+    undo_field,
+)
 from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
 from semcal_ros.core.calibration.judgement.outliers import (
     find_outliers,
@@ -201,6 +204,8 @@ _FLAT_RAD = np.radians(1.0)
 # Part of the largest singular value below which views of lines leave a linear distortion to its prior: where all lines
 # run within 10 degrees of each other, or in two directions only, it is 0.02 or less.
 _DETERMINED = 0.05
+# Angle between lines below which they count as one direction: from 8 degrees, a pixel size was wrong by 8 %, four sigmas.
+_APART_RAD = np.radians(30.0)
 
 
 def _prepare_lines(
@@ -224,7 +229,11 @@ def _prepare_lines(
                 do="leave this view out, or use a grid of two directions",
             )
     flat = tuple(replace(view, stage=None) for view in views)
-    return flat, replace(options, untilted="all"), _find_open_directions(flat)
+    open_directions = _find_open_directions(flat)
+    if options.residual == "auto" and len({v.magnification for v in views}) < ENOUGH_MAGNIFICATIONS:
+        # A view that is left out has a direction of its own, which the others do not predict.
+        options = replace(options, residual="off")
+    return flat, replace(options, untilted="all"), open_directions
 
 
 def _find_open_directions(views: Sequence[GridView]) -> list[Finding]:
@@ -233,21 +242,23 @@ def _find_open_directions(views: Sequence[GridView]) -> list[Finding]:
     Raises
     ------
     CalibrationError
-        If all lines run in one direction.
+        If all lines run in one direction, or nearly so.
     """
     across = np.stack([np.mean(view.across, axis=0) for view in views if view.across is not None])
     x, y = (across / np.linalg.norm(across, axis=1, keepdims=True)).T
     # The distance of lines changes with the stretch along both axes, and with the shear.
     values = np.linalg.svd(np.stack([x * x, y * y, x * y], axis=1), compute_uv=False)
     known = int(np.sum(values > _DETERMINED * values[0]))
-    if known >= 3:
-        return []
-    if known == 1:
+    apart = float(np.max(np.arccos(np.clip(np.abs(np.outer(x, x) + np.outer(y, y)), 0.0, 1.0))))
+    if apart < _APART_RAD:
         raise CalibrationError(
-            "parallel lines that run in one direction in all views, so that lengths along them are not known",
-            expected="lines in at least two directions, best in three",
+            f"parallel lines that run in one direction in all views, within {np.degrees(apart):.0f} degrees, so that "
+            "lengths along them are not known",
+            expected=f"lines in at least two directions, {np.degrees(_APART_RAD):.0f} degrees apart, best in three",
             do="add views with the grating turned by 90 and by 45 degrees",
         )
+    if known >= 3:
+        return []
     text = (
         "scale: the lines run in two directions only, which leaves a combination of pixel sizes and skew to its "
         "prior: add views with the grating turned to a third direction, best by 45 degrees"

@@ -135,9 +135,9 @@ class ScanTiming:
         passes_s = 0.5 * (self.averages - 1) * self.frame_time_s - self._lag_s
         within_line = np.asarray(col, dtype=np.float64) / cols
         if self.bidirectional:
-            # What lies between two lines is interpolated from both, and so is its time.
-            of_odd = 1.0 - np.abs(np.asarray(row, dtype=np.float64) % 2.0 - 1.0)
-            within_line = within_line + of_odd * (1.0 - 2.0 * within_line)
+            # The mean of two neighbours: times that alternate from line to line, by half a line at most, would give
+            # a map that does, too, and differs by the drift in that time.
+            within_line = np.full_like(within_line, 0.5)
         within_line = within_line * (1.0 - self.flyback_fraction)
         if self.line_averages > 1:
             within_line = (within_line + 0.5 * (self.line_averages - 1)) / self.line_averages

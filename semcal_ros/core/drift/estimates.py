@@ -204,7 +204,7 @@ class DriftUpdate(DriftEstimate):
         (2, 2) the part of the covariance that is due to images that contradict the prediction, this one or
         those before; zero where the drift rests on the frame's own image.
     along
-        (2,) direction of the lines that the frame shows, px: the drift along them is only predicted; None where both
+        (2,) direction of the lines that frames show, px: the drift along them is only predicted; None where both
         directions are measured.
     unseen
         (2, 2) the part of the covariance that is due to that prediction; zero where both directions are measured.

@@ -67,7 +67,7 @@ from semcal_ros.core.drift.measurement import (
     make_measurement,
     measure_itself,
 )
-from semcal_ros.core.drift.operations import CorrectShear, Marginalise, Measure, Predict
+from semcal_ros.core.drift.operations import CorrectShear, Inflate, Marginalise, Measure, Predict
 from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
 from semcal_ros.core.drift.similarity import (
     SimilarityMatch,
@@ -129,7 +129,8 @@ class _Track:
     something in the last frame that matched did not move with the specimen. ``before`` is the last frame as it came,
     and ``overlay`` what is drawn into all of them, of which there were ``seen``. Where the specimen shows lines only,
     ``along`` (2,) is their direction in px, ``unseen`` what was known before the first frame that did not tell the
-    drift along them, and ``of_unseen`` (2, 2) what that adds to the covariance of the last frame.
+    drift along them, ``of_unseen`` (2, 2) what that adds to the covariance of the last frame, and ``blind`` the keyframes
+    that were made since, whose own place along the lines was only predicted.
     """
 
     filter: DriftFilter
@@ -147,6 +148,7 @@ class _Track:
     along: Array | None = None
     unseen: DriftState | None = None
     of_unseen: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    blind: set[int] = field(default_factory=set)
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
     similarity: SimilarityTracker = field(
         default_factory=lambda: SimilarityTracker(keeps_history=False)
@@ -161,6 +163,20 @@ class _Track:
         direction = np.linalg.solve(px_from_unit, self.along)
         variance = float(self.along @ px_from_unit @ covariance @ px_from_unit.T @ self.along)
         return variance * np.outer(direction, direction)
+
+    def inflate(self, inflation: Inflate) -> None:
+        """Let the covariance grow, also that of what is only predicted since lines alone are seen."""
+        self.filter.apply(inflation)
+        if self.unseen is not None:
+            self.unseen = inflation(self.unseen, self.filter.process_noise)
+
+    def see_again(self) -> None:
+        """Both directions are known again; keyframes that were made in between are not."""
+        self.along = self.unseen = None
+        for key in self.blind & set(self.store.keys):
+            self.store.forget(key)
+            self.forget(key)
+        self.blind.clear()
 
     def forget(self, key: int) -> None:
         """Remove a keyframe from what is estimated."""
@@ -384,6 +400,8 @@ class DriftTracker:
         key, forgotten = track.store.add(keyframe, reference)
         track.filter.add_keyframe(key, removed, frame.acceleration_term_s2)
         track.similarity.add_keyframe(key, turn, time_s)
+        if track.unseen is not None:
+            track.blind.add(key)
         for old in forgotten:
             track.forget(old)
         return None
@@ -417,7 +435,7 @@ class DriftTracker:
         drift_filter.apply(Predict(centre_s))
         track.similarity.predict(centre_s)
         if 0.0 < _PAUSE * drift_filter.process_noise.time_constant_s < dt:
-            drift_filter.apply(inflate_after_pause(speed, dt))
+            track.inflate(inflate_after_pause(speed, dt))
 
     def _follow(self, track: _Track, frame: ScanFrame) -> DriftUpdate:
         """Register the frame against the best keyframes, until one of them holds."""
@@ -431,6 +449,9 @@ class DriftTracker:
             ratio = track.store.smallest_scale_ratio(frame)
             reason = f"scale changed by a factor of {ratio:.2f}"
             return self._restart(track, frame, Rejection(MatchFailure.SCALE_CHANGE, reason))
+        if track.unseen is not None:
+            # What was seen in both directions can tell them again.
+            candidates = sorted(candidates, key=lambda c: c.key in track.blind)
         # Where nothing matched before, the image may be that of any of them.
         is_steady = track.rejected == 0 and track.filter.pending is None
         rejected: list[_RejectedMatch] = []
@@ -592,11 +613,12 @@ class DriftTracker:
         """Update the filter by a match, unless it contradicts the prediction."""
         drift_filter, measure = track.filter, match.measure
         along = match.registration.along
-        unseen = track.unseen_covariance(frame.px_from_unit)
-        if along is None and np.any(unseen):
-            # What is seen again may be anywhere along the lines.
-            drift_filter.apply(inflate_position(unseen))
         state = drift_filter.state
+        # A keyframe of lines says nothing of the drift along them, whatever came into the picture since.
+        sees_again = along is None and track.unseen is not None and measure.key not in track.blind
+        anywhere = inflate_position(track.unseen_covariance(frame.px_from_unit))
+        if sees_again:
+            state = anywhere(state, drift_filter.process_noise)
         expected, _ = state.predict_shift(measure.key)
         innovation = measure.shift[:2] - expected
         keyframe = track.store[measure.key]
@@ -620,13 +642,15 @@ class DriftTracker:
             deviation = innovation / _DISPUTED_SIGMAS
             disputed = np.outer(deviation, deviation)
             return _RejectedMatch(judged, match.registration, disputed)
+        if sees_again:
+            drift_filter.apply(anywhere)
+            track.see_again()
         if judged is not None:
-            drift_filter.apply(judged)
-        if along is not None and track.unseen is None:
-            track.unseen = state.without_keyframes()
-        track.along = along
-        if along is None:
-            track.unseen = None
+            track.inflate(judged)
+        if along is not None:
+            track.along = along
+            if track.unseen is None:
+                track.unseen = drift_filter.state.without_keyframes()
         since_s = state.time_s - track.time_s
         track.similarity.use(match.similarity, since_s)
         if outcome.shear_nis > GATE:
@@ -637,7 +661,9 @@ class DriftTracker:
             # A zoom in small steps would make a long chain of keyframes.
             measure = zoomed
         drift_filter.update(measure)
-        drift_filter.adapt_process_noise(outcome.nis, measure.covariance[:2, :2], since_s)
+        # Of two directions, one was the predicted one.
+        nis = outcome.nis if along is None else 2.0 * outcome.nis
+        drift_filter.adapt_process_noise(nis, measure.covariance[:2, :2], since_s)
         if not match.candidate.rescaled:
             self._look_for_flicker(track, frame, match)
         return None
@@ -693,7 +719,8 @@ class DriftTracker:
                     measure = add_zoom_uncertainty(measure, before, frame)
                 _rekey(track, frame, match, measure, noise)
                 status = DriftStatus.KEYFRAME
-        elif self.settings.average and _is_mergeable(match, store):
+        elif self.settings.average and track.unseen is None and _is_mergeable(match, store):
+            # Not of lines alone: what came into the picture since would be where it was predicted to be.
             keyframe = store[candidate.key]
             mean = keyframe.with_frame(match.image, match.region, registration)
             store.replace(candidate.key, mean)
@@ -721,12 +748,12 @@ class DriftTracker:
         if is_lost:
             reach_px = self._reach_px(frame)
             speed_px_s = self.settings.first_step_px / since_s
-            track.filter.apply(inflate_when_lost(frame.px_from_unit, reach_px, speed_px_s))
+            track.inflate(inflate_when_lost(frame.px_from_unit, reach_px, speed_px_s))
         else:
             nearest = np.asarray(np.linalg.solve(frame.px_from_unit, registration.nearest_px))
             inflation = inflate_if_contradicted(state, track.store.current, nearest, since_s)
             if inflation is not None:
-                track.filter.apply(inflation)
+                track.inflate(inflation)
         if is_lost or (rescaled and is_of_keyframe):
             return self._restart(track, frame, rejection)
         return _make_update(
@@ -816,6 +843,8 @@ def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noi
         track.similarity.add_keyframe(key, turn, state.time_s)
     else:
         track.similarity.clone_keyframe(key, measure.key, match.registration, turn, state.time_s)
+    if track.unseen is not None:
+        track.blind.add(key)
     for old in forgotten:
         track.forget(old)
     return key
@@ -875,7 +904,7 @@ def _make_update(
         similarity_covariance=similarity.covariance,
         doubt=track.doubt,
         unseen=unseen,
-        along=None if registration is None else registration.along,
+        along=track.along,
         moving=None if registration is None else registration.moving,
         of_scale=of_scale[:2, :2],
     )

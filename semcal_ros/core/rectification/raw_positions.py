@@ -190,7 +190,7 @@ class PixelDrift:
         """By how much a step of the time towards that of the raw pixel makes its error smaller, at least; at most 1.
 
         Rows by which the drift at its fastest moves while a row is scanned, twice, because the distortion stretches
-        what moves. Times at the ends of lines that are scanned to and fro grow twice as fast.
+        what moves.
         """
         if self._timing is None:
             return 0.0
@@ -200,8 +200,7 @@ class PixelDrift:
         speed += 2.0 * float(np.hypot(*self._half_acceleration_px)) * time_s
         if self._turns:
             speed += float(np.hypot(*self._rate[:, 0])) * (width + height)
-        growth = 4.0 if self._timing.bidirectional else 2.0
-        return min(growth * speed * self._timing.frame_time_s / height, 1.0)
+        return min(2.0 * speed * self._timing.frame_time_s / height, 1.0)
 
     def displacement(self, raw: Array) -> Array:
         """(n, 2) by how much the drift displaces what is scanned at raw pixels (n, 2)."""

@@ -76,6 +76,34 @@ def test_across_is_measured_and_along_is_honestly_predicted(
     assert np.all(np.diff(free) > 0.0)
 
 
+def test_a_tool_that_comes_in_does_not_tell_the_drift_along_scratches() -> None:
+    frames, drift, _ = draw(KINDS["tool over scratches"], 101)
+    tracker = DriftTracker()
+    for k, frame in enumerate(frames):
+        update = tracker.update(frame, float(k))
+        if k > 1:
+            error = update.drift_px - drift[k]
+            assert abs(error @ ALONG) < 3.0 * sigma(update.covariance, ALONG)
+            assert abs(error @ ACROSS) < 3.5 * max(sigma(update.covariance, ACROSS), 0.02)
+
+
+def test_what_is_predicted_along_lines_is_not_taken_for_known_again() -> None:
+    """Particles that come in later tell how they move, and not how far the specimen has moved before."""
+    frames, drift = scratched(20)
+    rng = np.random.default_rng(0)
+    places = np.array([190.0, 190.0]) + rng.uniform(-150.0, 150.0, (60, 2))
+    tracker = DriftTracker()
+    for k, frame in enumerate(frames):
+        picture = frame.astype(np.float32)
+        for place in (places + drift[k]) if k >= 10 else ():
+            spot = np.rint(place * 16).astype(int)
+            cv2.circle(picture, (int(spot[0]), int(spot[1])), 48, 220.0, -1, cv2.LINE_AA, 4)
+        noisy = picture + rng.normal(0.0, 6.0, picture.shape)
+        update = tracker.update(np.clip(noisy, 0, 255).astype(np.uint8), float(k))
+    assert sigma(update.covariance, ALONG) > 10.0
+    assert update.along is not None
+
+
 def test_particles_tell_the_drift_along_scratches_too() -> None:
     frames, drift = scratched(3)
     middle, rng = np.array([190.0, 190.0]), np.random.default_rng(0)

@@ -222,11 +222,15 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
     variance = squares / max(float(np.sum(result.huber_weight >= 1.0)), 1.0)
     weight = np.sqrt(pairs[known]) / variance
     target = product[known] / pairs[known] * weight
-    design = np.stack([np.exp(-0.5 * (lag / s) ** 2) for s in _LENGTHS], axis=1) * weight[:, None]
+    # What is nearly gone at the least distance that was compared would take any variance.
+    lengths = [s for s in _LENGTHS if s >= lag[0]]
+    if not lengths:
+        return LineJitter()
+    design = np.stack([np.exp(-0.5 * (lag / s) ** 2) for s in lengths], axis=1) * weight[:, None]
     found, left = nnls(design, target)
     if float(target @ target) - left**2 < _SIGNIFICANT:
         return LineJitter()
-    parts = [(float(v), s) for v, s in zip(found, _LENGTHS, strict=True) if v > 0.0]
+    parts = [(float(v), s) for v, s in zip(found, lengths, strict=True) if v > 0.0]
     return LineJitter(tuple(v for v, _ in parts), tuple(s for _, s in parts))
 
 

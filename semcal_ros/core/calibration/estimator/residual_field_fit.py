@@ -46,6 +46,7 @@ from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = [
+    "ENOUGH_MAGNIFICATIONS",
     "FieldChoice",
     "FieldSystem",
     "FittedField",
@@ -72,8 +73,8 @@ _STEADINESS = 3.0
 _OVERLAP_PX = 1e-4
 # The field is taken to change slowly with the magnification: as a parabola in log g at most.
 _MAX_COEFFICIENTS_IN_G = 5
-# Fewer magnifications do not predict one that is left out.
-_ENOUGH_MAGNIFICATIONS = 4
+#: Fewer magnifications do not predict one that is left out.
+ENOUGH_MAGNIFICATIONS = 4
 # Bounds the time: every fold is solved once for each strength.
 _MAX_FOLDS = 6
 # Ridges that are tried in turn, relative to the diagonal: what elimination by subtraction loses.
@@ -274,7 +275,7 @@ def field_system(
         own = corners.rows[:, :, part]
         x, y = np.concatenate([own[:, :-1], rows, own[:, -1:]], axis=1)
         augmented[v][np.ix_(observed, observed)] += x @ x.T + y @ y.T
-    few = len(setup.magnifications) < _ENOUGH_MAGNIFICATIONS
+    few = len(setup.magnifications) < ENOUGH_MAGNIFICATIONS
     if few and scaled.effects is not None:
         # The members are views: each is taken for a visit of its own.
         own_visit = np.arange(len(setup.views), dtype=np.intp)
@@ -369,7 +370,7 @@ def held_prior(field: ResidualField, norm_px: float) -> Array:
 def _folds(system: FieldSystem) -> list[Mask]:
     """Return masks of the members that are left out together."""
     candidates = np.ones(len(system.group), dtype=bool)
-    if len(system.designs) >= _ENOUGH_MAGNIFICATIONS:
+    if len(system.designs) >= ENOUGH_MAGNIFICATIONS:
         # The calibration does not claim to hold beyond the outermost magnifications: they are not
         # left out.
         candidates[[0, -1]] = False
