@@ -28,7 +28,7 @@ from semcal_ros.core.errors import InvalidValueError
 __all__ = ["CalibratedFrame", "Positions"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Positions:
     """Points with their uncertainty.
 
@@ -49,7 +49,7 @@ class Positions:
         return np.sqrt(np.maximum(np.einsum("nii->ni", self.covariance), 0.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CalibratedFrame:
     """One frame, free of distortion and drift.
 
@@ -62,7 +62,8 @@ class CalibratedFrame:
     magnification
         At which it was taken; None where that is not known.
     P
-        (3, 4) projection: the homogeneous pixel of a homogeneous point of the sem frame, m; zero without a camera.
+        (3, 4) projection: the homogeneous pixel of a homogeneous point of the sem frame, m; it means nothing
+        where the frame is not :attr:`valid`.
     P_covariance
         (12, 12) covariance of its numbers, row by row; zero where it is not known.
     drift_m, drift_covariance
@@ -87,7 +88,7 @@ class CalibratedFrame:
 
     @property
     def pixel_size_m(self) -> float:
-        """Side of a pixel in the plane z = 0, m; NaN without a camera."""
+        """Side of a pixel in the plane z = 0, m; NaN where P is zero."""
         return 1.0 / float(self.P[0, 0]) if self.P[0, 0] > 0.0 else float("nan")
 
     @property
@@ -101,7 +102,7 @@ class CalibratedFrame:
         """Points of the sem frame, m, that are seen at pixels.
 
         The covariance holds that of the calibration, of the drift and of the pixels. Most of it is common to all points
-        of a frame, since the place of the optical axis is known to many pixels only: for lengths within a frame use
+        of a frame, since the place of the optical axis is uncertain by many pixels: for lengths within a frame use
         :meth:`displacement`.
 
         Parameters
@@ -116,7 +117,7 @@ class CalibratedFrame:
         Raises
         ------
         InvalidValueError
-            If the frame is not :attr:`valid`, or for another shape.
+            If the frame is not :attr:`valid`, for another shape, or for a height that is not in front of the pivot.
         """
         pixels = self._checked(uv, 2)
         values, by_projection, by_pixel = self._unproject(pixels, height_m)
@@ -134,10 +135,15 @@ class CalibratedFrame:
     ) -> Positions:
         """Displacements in the sem frame, m, between pixels of this frame.
 
-        The axis and the drift are those of both ends, so that the scale and ``sigma_px`` of either end remain.
-        Parameters and errors are those of :meth:`metres_from_pixels`.
+        Both ends share the errors of the optical axis and of the drift, which cancel: what remains are those of the
+        scale, and ``sigma_px`` at either end. One of the two may be a single point. Parameters and errors are those of
+        :meth:`metres_from_pixels`.
         """
         start, end = self._checked(start_uv, 2), self._checked(end_uv, 2)
+        if len(start) != len(end) and 1 not in (len(start), len(end)):
+            raise InvalidValueError(
+                f"{len(start)} starts and {len(end)} ends", expected="as many, or one of either"
+            )
         first, by_first, by_pixel = self._unproject(start, height_m)
         last, by_last, _ = self._unproject(end, height_m)
         by = by_last - by_first
@@ -160,10 +166,9 @@ class CalibratedFrame:
         InvalidValueError
             As :meth:`metres_from_pixels`, or if a point is not in front of the pivot.
         """
-        points = np.atleast_2d(np.asarray(xyz_m, dtype=np.float64))
-        if points.shape[-1] == 2:
+        points = self._checked(xyz_m, 2, 3)
+        if points.shape[1] == 2:
             points = np.column_stack([points, np.zeros(len(points))])
-        points = self._checked(points, 3)
         homogeneous = np.column_stack([points, np.ones(len(points))])
         seen = homogeneous @ self.P.T
         if not np.all(seen[:, 2] > 0.0):
@@ -178,12 +183,19 @@ class CalibratedFrame:
         covariance = by @ self.P_covariance @ np.swapaxes(by, 1, 2)
         matrix = self.P[:2, :2] / seen[:, 2, None, None]
         own = sigma_m**2 * np.eye(2) + self.drift_covariance
+        if not np.all(np.isfinite(own)):
+            # A drift that was never measured.
+            return Positions(values, np.broadcast_to(np.diag([np.inf, np.inf]), covariance.shape))
         covariance += matrix @ own @ np.swapaxes(matrix, 1, 2)
         return Positions(values, covariance)
 
     def _unproject(self, uv: Array, height_m: float) -> tuple[Array, Array, Array]:
         """(n, 2) points, and their derivatives by the projection (n, 2, 12) and by the pixel (2, 2)."""
         weight = float(self.P[2, 2]) * height_m + float(self.P[2, 3])
+        if not 0.0 < weight < np.inf:
+            raise InvalidValueError(
+                f"a height of {height_m} m", expected="one in front of the pivot of the beam"
+            )
         inverse = np.linalg.inv(self.P[:2, :2])
         xy = (uv * weight - self.P[:2, 2] * height_m - self.P[:2, 3]) @ inverse.T
         ones = np.ones(len(xy))
@@ -195,14 +207,16 @@ class CalibratedFrame:
             by[:, k, 11] = uv[:, k]
         return xy, inverse @ by, np.asarray(inverse * weight, dtype=np.float64)
 
-    def _checked(self, points: ArrayLike, width: int) -> Array:
+    def _checked(self, points: ArrayLike, *widths: int) -> Array:
         if not self.valid:
             raise InvalidValueError(
                 f"lengths in a frame without them: {self.reason}", expected="a valid frame"
             )
-        out = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        if out.ndim != 2 or out.shape[1] != width or not np.all(np.isfinite(out)):
-            raise InvalidValueError(
-                f"points of shape {out.shape}", expected=f"(n, {width}) finite numbers"
-            )
+        expected = f"(n, {' or '.join(map(str, widths))}) finite numbers"
+        try:
+            out = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError("points that are no numbers", expected=expected) from error
+        if out.ndim != 2 or out.shape[1] not in widths or not np.all(np.isfinite(out)):
+            raise InvalidValueError(f"points of shape {out.shape}", expected=expected)
         return out

@@ -42,6 +42,8 @@ __all__ = ["CalibratedStream"]
 
 # Frames that wait for their other parts: more than the queues of all inputs hold.
 _WAITING = 16
+# Seconds between looks at the publishers.
+_CHECKED_S = 1.0
 
 
 class CalibratedStream:
@@ -57,7 +59,7 @@ class CalibratedStream:
     node
         The node that subscribes.
     on_frame
-        Called with each frame. What it raises ends the executor, as of any callback.
+        Called with each frame. What it raises ends the executor, as a ``RuntimeError`` from it.
     config
         The ``msg_configs`` of the microscope, a name or a file: what its magnification topic carries.
     drift
@@ -66,7 +68,7 @@ class CalibratedStream:
     Attributes
     ----------
     missed
-        Frames that were passed over, or lost on the way.
+        Pictures that were passed over because not all that belongs to them came.
     """
 
     def __init__(
@@ -111,13 +113,17 @@ class CalibratedStream:
             topic="image_rect",
             databar_rows=0,
         )
+        # Publishers come and go, with another quality of service.
+        self._timer = node.create_timer(_CHECKED_S, endpoints.check_publishers)
 
     def _keeps(self, name: str, read: Callable[[Any], Any]) -> Callable[[Any, MessageInfo], None]:
         def keep(message: Any, _info: MessageInfo) -> None:
             try:
                 stamp_ns = stamp_ns_from_msg(message)
-                kept = self._parts[name]
-                kept[stamp_ns] = read(message)
+                kept, part = self._parts[name], read(message)
+                # At the end, also where a bag plays again.
+                kept.pop(stamp_ns, None)
+                kept[stamp_ns] = part
             except NODE_ERRORS as error:
                 self._reporter.reject(error)
                 return
@@ -128,6 +134,7 @@ class CalibratedStream:
         return keep
 
     def _on_image(self, frame: StreamFrame) -> None:
+        self._images.pop(frame.stamp_ns, None)
         self._images[frame.stamp_ns] = frame
         while len(self._images) > _WAITING:
             del self._images[next(iter(self._images))]
@@ -136,31 +143,42 @@ class CalibratedStream:
 
     def _hand_over(self, stamp_ns: int) -> None:
         """Call back with a frame if all of it has come."""
-        if stamp_ns not in self._images or any(stamp_ns not in p for p in self._parts.values()):
+        frame = self._images.get(stamp_ns)
+        if frame is None:
             return
-        found = {name: kept.pop(stamp_ns) for name, kept in self._parts.items()}
-        order = list(self._images)
-        place = order.index(stamp_ns)
-        frame = self._images.pop(stamp_ns)
-        # What came before and is not complete now never will be: messages arrive in their order.
-        for older in order[:place]:
-            del self._images[older]
-            for kept in self._parts.values():
-                kept.pop(older, None)
-        self.missed += place
+        # A frame that was scanned while the magnification changed has no drift.
+        needed = {name for name in self._parts if not (name == "drift" and frame.mixed)}
+        if any(stamp_ns not in self._parts[name] for name in needed):
+            return
+        found = {name: self._parts[name][stamp_ns] for name in needed}
+        # What came before and is not complete now never will be: the messages of a topic arrive in their order.
+        self.missed += _drop_until(stamp_ns, self._images) - 1
+        for name in needed:
+            _drop_until(stamp_ns, self._parts[name])
         drift_m, covariance = found.get("drift", (np.zeros(2), np.zeros((2, 2))))
-        self._on_frame(
-            CalibratedFrame(
-                frame.image,
-                frame.stamp_ns,
-                frame.magnification,
-                found["projection"],
-                found["covariance"],
-                drift_m,
-                covariance,
-                _explain(frame, found["projection"]),
-            )
+        handed_on = CalibratedFrame(
+            frame.image,
+            frame.stamp_ns,
+            frame.magnification,
+            found["projection"],
+            found["covariance"],
+            drift_m,
+            covariance,
+            _explain(frame, found["projection"]),
         )
+        try:
+            self._on_frame(handed_on)
+        except NODE_ERRORS as error:
+            # The input would take it for one of its messages.
+            raise RuntimeError(f"on_frame raised: {error}") from error
+
+
+def _drop_until(stamp_ns: int, waiting: dict[int, Any]) -> int:
+    """Remove an entry and what came before it; how many those are."""
+    count = list(waiting).index(stamp_ns) + 1
+    for _ in range(count):
+        del waiting[next(iter(waiting))]
+    return count
 
 
 def _read_drift(message: PoseWithCovarianceStamped) -> tuple[Array, Array]:

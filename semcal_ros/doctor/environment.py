@@ -28,6 +28,7 @@ from pathlib import Path
 from packaging.utils import canonicalize_name
 
 from semcal_ros.doctor.observations import Environment
+from semcal_ros.middleware.ament_prefix import prefixes_of_user
 
 __all__ = ["collect_environment"]
 
@@ -71,8 +72,7 @@ def _probe_ros() -> tuple[str, str, str, str]:
     reason.
     """
     # This command has put its own prefix there, which a script of the user's does not do.
-    prefixes = os.environ.get(_PREFIXES, "").split(os.pathsep)
-    outer = {**os.environ, _PREFIXES: os.pathsep.join(p for p in prefixes if p != sys.prefix)}
+    outer = {**os.environ, _PREFIXES: os.pathsep.join(prefixes_of_user())}
     command = [sys.executable, "-W", "ignore", "-c", _PROBE]
     try:
         done = subprocess.run(

@@ -21,7 +21,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -77,11 +77,11 @@ T = TypeVar("T")
 ENCODINGS = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
 
 
+# Images of a bag in which a data bar is looked for, and the first ones among which they are.
+_LOOKED_AT, _AMONG = 3, 30
 # Beyond these, a unit was forgotten: from a tenth of a picometre, far below an atom, to a metre for
 # the pixel of a photograph; from a photographed wall to what bags accept; from a microsecond, which
 # no raster scan reaches, to the time limit of a configuration's frame.
-# Images of a bag in which a data bar is looked for.
-_LOOKED_AT = 3
 _RANGES = {
     "pixel_size_m": (1e-13, 1.0, "m", "state the unit, as in --pixel-size 43.9nm"),
     "magnification": (1e-3, MAGNIFICATION_LIMITS[1], "", "correct --magnification"),
@@ -521,10 +521,13 @@ class _BagRecording(Recording):
     def _cut_databar(self) -> None:
         """Find a bar of text that the configuration does not tell of in some images, and note it."""
         found: list[int] = []
-        for raw in self._reader.raw_messages([self._image_topic.name]):
+        for raw in islice(self._reader.raw_messages([self._image_topic.name]), _AMONG):
             try:
                 pixels, _ = decoded_image(self._reader.decode(raw))
             except SemcalError:
+                continue
+            if np.ptp(pixels[: len(pixels) // 2]) == 0:
+                # A blanked beam: there is nothing that a bar would differ from.
                 continue
             found.append(find_databar(pixels))
             if len(found) == _LOOKED_AT or not found[-1]:

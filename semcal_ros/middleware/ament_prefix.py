@@ -20,10 +20,13 @@ import os
 import sys
 from pathlib import Path
 
-__all__ = ["add_environment_prefix"]
+__all__ = ["add_environment_prefix", "prefixes_of_user"]
 
 _VARIABLE = "AMENT_PREFIX_PATH"
 _MARKER = Path("share", "ament_index", "resource_index", "packages", "semcal_ros")
+
+
+_added: list[str] = []
 
 
 def add_environment_prefix() -> None:
@@ -35,3 +38,9 @@ def add_environment_prefix() -> None:
     prefixes = [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p]
     if sys.prefix not in prefixes and (Path(sys.prefix) / _MARKER).is_file():
         os.environ[_VARIABLE] = os.pathsep.join([sys.prefix, *prefixes])
+        _added.append(sys.prefix)
+
+
+def prefixes_of_user() -> list[str]:
+    """Return the prefixes of ``AMENT_PREFIX_PATH`` that :func:`add_environment_prefix` did not put there."""
+    return [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p and p not in _added]

@@ -201,10 +201,10 @@ def are_enough(views: Sequence[GridView], options: CalibrationOptions) -> bool:
 
 # Largest tilt that the stage may say of a grating: it shortens the lines' distance by 1.5e-4.
 _FLAT_RAD = np.radians(1.0)
-# Part of the largest singular value below which views of lines leave a linear distortion to its prior: where all lines
-# run within 10 degrees of each other, or in two directions only, it is 0.02 or less.
+# Part of the largest singular value below which views of lines leave a linear distortion to its prior: where they run
+# in two directions only, within 3 degrees, it is 0.02 or less.
 _DETERMINED = 0.05
-# Angle between lines below which they count as one direction: from 8 degrees, a pixel size was wrong by 8 %, four sigmas.
+# Angle between lines below which they count as one direction: of 8 degrees, a pixel size was wrong by 8 %, 4 sigmas.
 _APART_RAD = np.radians(30.0)
 
 

@@ -129,8 +129,8 @@ class _Track:
     something in the last frame that matched did not move with the specimen. ``before`` is the last frame as it came,
     and ``overlay`` what is drawn into all of them, of which there were ``seen``. Where the specimen shows lines only,
     ``along`` (2,) is their direction in px, ``unseen`` what was known before the first frame that did not tell the
-    drift along them, ``of_unseen`` (2, 2) what that adds to the covariance of the last frame, and ``blind`` the keyframes
-    that were made since, whose own place along the lines was only predicted.
+    drift along them, ``of_unseen`` (2, 2) what that adds to the covariance of the last frame, and ``blind`` the
+    keyframes that were made since, whose own place along the lines was only predicted.
     """
 
     filter: DriftFilter

@@ -288,6 +288,10 @@ class FrameInput:
         """Warn of a data bar that the configuration does not tell of, at the first image of a size."""
         if self._lines is None or self._databar_rows or image.shape == self._looked_at:
             return
+        upper = image[: len(image) // 2]
+        if upper.min() == upper.max():
+            # A blanked beam: there is nothing that a bar would differ from.
+            return
         self._looked_at = image.shape
         rows = find_databar(image)
         self._barred = (

@@ -142,6 +142,7 @@ class ViewedImages:
             for node in ("stream_corrector", "drift_compensator")
         }
         self._mask: _Waiting | None = None
+        self._masked_s = 0.0
         self._kept: deque[_Waiting] = deque()
         self._newest: _Waiting | None = None
         self._seen_s = 0.0
@@ -184,7 +185,7 @@ class ViewedImages:
                 break
         for subscription in self._moving.values():
             while (taken := subscription.take()) is not None:
-                self._mask = _waiting(taken)
+                self._mask, self._masked_s = _waiting(taken), now_s
         corrected = self._newest if now_s - self._seen_s < _STALE_S else None
         raw = self._raw_of(corrected)
         if raw is None and corrected is None:
@@ -205,7 +206,7 @@ class ViewedImages:
         first = raw or corrected
         assert first is not None
         moving: Outlines = ()
-        if corrected is not None and self._mask is not None:
+        if corrected and self._mask and now_s - self._masked_s < _STALE_S:
             # The mask follows its picture; that of the frame before is as good for the eye.
             moving = outline(self._unpack(self._mask, Image))
         return ViewedFrame((corrected or first).stamp_ns, first.sent_ns, pictures, moving)

@@ -193,7 +193,7 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
     The result is without parts where nothing significant is found.
     """
     product, pairs = np.zeros(_MOST_LAG), np.zeros(_MOST_LAG)
-    squares = 0.0
+    squares, used = 0.0, 0.0
     for part in _views(problem):
         inlier = result.huber_weight[part] >= 1.0
         x = result.residuals_px[part, 0]
@@ -213,13 +213,14 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
         product[0] -= x @ x
         pairs[0] -= inlier.sum()
         squares += float(x @ x)
+        used += float(inlier.sum())
     product[0] *= 0.5
     pairs[0] *= 0.5
     known = pairs >= _ENOUGH_PAIRS
     if not np.any(known):
         return LineJitter()
     lag = np.arange(_MOST_LAG)[known]
-    variance = squares / max(float(np.sum(result.huber_weight >= 1.0)), 1.0)
+    variance = squares / max(used, 1.0)
     weight = np.sqrt(pairs[known]) / variance
     target = product[known] / pairs[known] * weight
     # What is nearly gone at the least distance that was compared would take any variance.
