@@ -329,6 +329,7 @@ KINDS: dict[str, Kind] = {
     "tool over gold from the start": Kind(gold, tool_from_start),
     "tool over fine": Kind(fine, tool),
     "tool over ridges": Kind(ridges, tool),
+    "tool over a lattice": Kind(lattice, tool),
     "two tools": Kind(gold, two_tools),
     "rough tool": Kind(fine, textured_tool),
     "pushed particle": Kind(gold, pushed),

@@ -24,7 +24,7 @@ from semcal_ros.core.calibration.judgement.evaluate import (
     fit_poses,
     rms_by_magnification,
 )
-from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.core.calibration.views import RejectedView, refuse_tilted_lines
 from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
@@ -163,6 +163,7 @@ def evaluate(
         if squares_m is None
         else check_positives(squares_m, "squares_m"),
     )
+    refuse_tilted_lines(collected.views)
     on_progress("fitting the views", 0, None)
     record = model.record or FitRecord(_HEIGHT_SIGMA_M)
     height_m = record.height_sigma_m

@@ -127,9 +127,27 @@ def test_points_of_another_shape_are_refused(points: object) -> None:
         made().metres_from_pixels(points)  # type: ignore[arg-type]
 
 
+def test_points_that_are_no_numbers_or_not_as_many_are_refused() -> None:
+    with pytest.raises(InvalidValueError, match="no numbers"):
+        made().metres_from_pixels("abc")  # type: ignore[arg-type]
+    with pytest.raises(InvalidValueError, match="3 starts and 2 ends"):
+        made().displacement(UV, UV[:2])
+    assert made().displacement(UV[0], UV).values.shape == (3, 2)
+
+
 def test_points_behind_the_pivot_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="behind the pivot"):
         made().pixels_from_metres([0.0, 0.0, -0.011])
+    for height_m in (-0.011, np.nan):
+        with pytest.raises(InvalidValueError, match="a height of"):
+            made().metres_from_pixels(UV, height_m=height_m)
+
+
+def test_a_drift_that_was_never_measured_leaves_no_place_known() -> None:
+    frame = made(drift_covariance=np.full((2, 2), np.inf))
+    assert np.all(np.isinf(frame.pixels_from_metres([[1e-6, 2e-6]]).sigma))
+    assert np.all(np.isinf(frame.metres_from_pixels(UV).sigma))
+    assert np.all(np.isfinite(frame.displacement(UV[0], UV[1]).sigma))
 
 
 def test_it_agrees_with_the_camera_of_a_calibration() -> None:

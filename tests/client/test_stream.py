@@ -30,6 +30,7 @@ from semcal_ros.bridge.drift import fill_drift
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.client import CalibratedFrame, CalibratedStream
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import InvalidValueError
 from tests.helpers.node_scenes import (
     image_message,
     magnification_message,
@@ -63,11 +64,18 @@ class Bench:
         peer.spin(0.3)
 
     def send(
-        self, stamp_s: float, *, camera: ScanCamera | None = CAMERA, without: str = ""
+        self,
+        stamp_s: float,
+        *,
+        camera: ScanCamera | None = CAMERA,
+        without: str = "",
+        only: str = "",
+        drift_m: float | None = None,
     ) -> None:
         image = image_message(texture(int(stamp_s * 10) % 7), stamp_s)
         drift = PoseWithCovarianceStamped()
-        fill_drift(drift, (1e-9 * stamp_s, 2e-9), np.eye(2) * 1e-18, image.header)
+        moved_m = 1e-9 * stamp_s if drift_m is None else drift_m
+        fill_drift(drift, (moved_m, 2e-9), np.eye(2) * 1e-18, image.header)
         parts: dict[str, tuple[Any, Any]] = {"drift": (self.drifts, drift)}
         for name, publisher, fill in (
             ("projection", self.projections, fill_stamped_projection),
@@ -78,7 +86,7 @@ class Bench:
             parts[name] = publisher, message
         parts["image"] = self.images, image
         for name, (publisher, message) in parts.items():
-            if name != without:
+            if name != without and only in ("", name):
                 publisher.publish(message)
 
     def wait(self, count: int) -> None:
@@ -135,3 +143,30 @@ def test_a_damaged_part_is_no_end(bench: Bench) -> None:
     bench.send(2.0)
     bench.wait(1)
     assert bench.stamps_s == [2.0]
+
+
+@pytest.mark.parametrize("last", ["image", "drift"])
+def test_what_a_callback_raises_ends_the_executor_whichever_part_comes_last(
+    bench: Bench, last: str
+) -> None:
+    def fails(_frame: CalibratedFrame) -> None:
+        raise InvalidValueError("a length", expected="none")
+
+    bench.stream._on_frame = fails
+    bench.send(1.0, without=last)
+    bench.peer.spin(0.3)
+    bench.send(1.0, only=last)
+    with pytest.raises(RuntimeError, match="on_frame raised: a length"):
+        bench.peer.spin(2.0)
+
+
+def test_parts_of_the_loop_before_do_not_meet_the_pictures_of_this_one(bench: Bench) -> None:
+    stamps_s = (1.0, 2.0, 3.0)
+    for loop in range(3):
+        for stamp_s in stamps_s:
+            # A picture was lost in the first loop.
+            lost = "image" if (loop, stamp_s) == (0, 2.0) else ""
+            bench.send(stamp_s, without=lost, drift_m=1e-9 * loop)
+        bench.wait(3 * loop + 2)
+    drifts = [round(frame.drift_m[0] * 1e9) for frame in bench.frames]
+    assert drifts == [0, 0, 1, 1, 1, 2, 2, 2]

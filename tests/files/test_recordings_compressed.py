@@ -213,7 +213,9 @@ def test_an_outline_needs_no_decoding(tmp_path: Path, codec: str) -> None:
 def test_a_data_bar_that_nobody_told_of_is_cut_off_and_said(
     tmp_path: Path, databar_rows: int | None
 ) -> None:
-    barred = [with_bar(scanned(), 30, f"5.0 kV {k} um") for k in range(4)]
+    # The beam was blanked at first.
+    barred = [with_bar(np.zeros_like(scanned()), 30, "5.0 kV")]
+    barred += [with_bar(scanned(), 30, f"5.0 kV {k} um") for k in range(4)]
     made = [
         ("/sem/image_raw", message(barred_picture, "mono8", T0 + (k + 1) * 1_000_000))
         for k, barred_picture in enumerate(barred)

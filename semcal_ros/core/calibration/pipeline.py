@@ -78,7 +78,12 @@ from semcal_ros.core.calibration.start import (
     start,
     with_excess,
 )
-from semcal_ros.core.calibration.views import GridView, RejectedView, ViewStatus
+from semcal_ros.core.calibration.views import (
+    GridView,
+    RejectedView,
+    ViewStatus,
+    refuse_tilted_lines,
+)
 from semcal_ros.core.corners.detection import MINIMUM_CORNERS
 from semcal_ros.core.errors import (
     CalibrationError,
@@ -199,8 +204,6 @@ def are_enough(views: Sequence[GridView], options: CalibrationOptions) -> bool:
     return bool(views) and known and options.method == "joint"
 
 
-# Largest tilt that the stage may say of a grating: it shortens the lines' distance by 1.5e-4.
-_FLAT_RAD = np.radians(1.0)
 # Part of the largest singular value below which views of lines leave a linear distortion to its prior: where they run
 # in two directions only, within 3 degrees, it is 0.02 or less.
 _DETERMINED = 0.05
@@ -220,14 +223,7 @@ def _prepare_lines(
             expected="method joint, and views that are not tilted",
             do="turn the grating instead of tilting it, or use a grid of two directions",
         )
-    for view in views:
-        tilt = 0.0 if view.stage is None or view.stage.tilt_rad is None else view.stage.tilt_rad
-        if abs(tilt) > _FLAT_RAD:
-            raise CalibrationError(
-                f"view {view.name} of parallel lines, tilted by {np.degrees(tilt):.1f} degrees",
-                expected="untilted views: what a tilt does to lines in one direction, another scale does as well",
-                do="leave this view out, or use a grid of two directions",
-            )
+    refuse_tilted_lines(views)
     flat = tuple(replace(view, stage=None) for view in views)
     open_directions = _find_open_directions(flat)
     if options.residual == "auto" and len({v.magnification for v in views}) < ENOUGH_MAGNIFICATIONS:

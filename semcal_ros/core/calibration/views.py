@@ -39,6 +39,7 @@ __all__ = [
     "add_excess_noise",
     "assign_squares",
     "estimate_excess_sigma_px",
+    "refuse_tilted_lines",
     "views_from_detections",
 ]
 
@@ -47,6 +48,9 @@ __all__ = [
 _MISFIT = 0.12
 # Deviation at which a size counts as wrong, as from a wrong magnification, however far off it is.
 _FAR = 0.3
+
+# Largest tilt that the stage may say of a grating: it shortens the lines' distance by 1.5e-4.
+_FLAT_RAD = np.radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -430,3 +434,23 @@ def estimate_excess_sigma_px(
 def add_excess_noise(views: Sequence[GridView], sigma_px: float) -> tuple[GridView, ...]:
     """Return the views with corners that are more uncertain by ``sigma_px`` per axis."""
     return tuple(view.add_excess_noise(sigma_px) for view in views)
+
+
+def refuse_tilted_lines(views: Sequence[GridView]) -> None:
+    """Raise :class:`CalibrationError` where the stage tilts a grating among the views: they must be flat, or be grids.
+
+    Raises
+    ------
+    CalibrationError
+        If a view is tilted, where any view is one of parallel lines.
+    """
+    if not any(view.across is not None for view in views):
+        return
+    for view in views:
+        tilt = 0.0 if view.stage is None or view.stage.tilt_rad is None else view.stage.tilt_rad
+        if abs(tilt) > _FLAT_RAD:
+            raise CalibrationError(
+                f"view {view.name}, tilted by {np.degrees(tilt):.1f} degrees, among views of parallel lines",
+                expected="untilted views: what a tilt does to lines in one direction, another scale does as well",
+                do="leave this view out, or use a grid of two directions",
+            )

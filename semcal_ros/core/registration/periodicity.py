@@ -22,6 +22,7 @@ the stage and no drift, and a prediction that is good to a tenth of it decides.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import scipy.fft
 
@@ -55,6 +56,8 @@ _REACH = 4.0
 # A defect is a tile that one shift explains so many robust deviations better than another one: by chance, 1 in 10^6
 # tiles. The squares of the deviations must sum to the evidence: two such tiles.
 _DEFECT_SIGMAS, _EVIDENCE = 5.0, 60.0
+# Of a body of tiles that lie together, at most: two of them make the evidence. As much against it is a second motion.
+_OF_ONE = 30.0
 # Part of the image's shorter side from which on a period is coarse, and of how many standard deviations of the
 # prediction half a period must consist to be predicted.
 _COARSE, _PREDICTED_SIGMAS = 1.0 / 16.0, 5.0
@@ -181,14 +184,15 @@ def choose_period(
         return Rejection(MatchFailure.NOT_CONVERGED, "refinement did not converge at any period")
     best = compared[0]
     for other in compared[1:]:
-        if _weigh(best[1], other[1]) < 0.0:
+        pro, contra = _weigh(best[1], other[1])
+        if pro < contra:
             best = other
     predicted = _find_predicted(compared, periods, guess, spread, fine[0].size)
-    if predicted is not None and (predicted is best or _weigh(best[1], predicted[1]) < _EVIDENCE):
+    if predicted is not None and (predicted is best or not _tells(best[1], predicted[1])):
         return predicted[0]
     x, y = best[0].shift_px.tolist()
     for other in compared:
-        if other is not best and _weigh(best[1], other[1]) < _EVIDENCE:
+        if other is not best and not _tells(best[1], other[1]):
             a, b = other[0].shift_px.tolist()
             return Rejection(
                 MatchFailure.AMBIGUOUS,
@@ -245,13 +249,31 @@ def _list_shifts(
     return found[order[allowed]][:_MOST_COMPARED]
 
 
-def _weigh(first: Array, second: Array) -> float:
-    """Evidence for the first of two shifts against the second, by the residual energies of their tiles."""
-    difference = (second - first).ravel()
-    difference = difference[np.isfinite(difference)]
-    if len(difference) == 0:
-        return 0.0
-    middle = float(np.median(difference))
-    deviations = (difference - middle) / max(mad_sigma(difference - middle), 1e-30)
-    clear = deviations[np.abs(deviations) > _DEFECT_SIGMAS]
-    return float(np.sum(np.sign(clear) * clear**2))
+def _tells(first: Array, second: Array) -> bool:
+    """Whether the defects are where the first of two shifts says, and none where the second does."""
+    pro, contra = _weigh(first, second)
+    return pro >= _EVIDENCE and contra < _OF_ONE
+
+
+def _weigh(first: Array, second: Array) -> tuple[float, float]:
+    """Evidence for the first of two shifts and for the second, by the residual energies (rows, cols) of their tiles.
+
+    What lies together counts as one defect, however large and clear it is: the outline of a tool must not outvote the
+    defects of a lattice.
+    """
+    difference = second - first
+    finite = np.isfinite(difference)
+    if not np.any(finite):
+        return 0.0, 0.0
+    middle = float(np.median(difference[finite]))
+    deviations = (difference - middle) / max(mad_sigma(difference[finite] - middle), 1e-30)
+    deviations = np.where(finite, deviations, 0.0)
+    return _count_defects(deviations), _count_defects(-deviations)
+
+
+def _count_defects(deviations: Array) -> float:
+    """Sum of the squares of clear deviations above zero, of each body of tiles that of one defect at most."""
+    clear = deviations > _DEFECT_SIGMAS
+    labels, bodies = cv2.connectedComponents(clear.astype(np.uint8), connectivity=8)
+    sums = np.bincount(bodies.ravel(), weights=(deviations**2).ravel(), minlength=labels)
+    return float(np.minimum(sums[1:], _OF_ONE).sum())

@@ -63,7 +63,11 @@ from semcal_ros.core.registration.normalised_correlation import (
 from semcal_ros.core.registration.one_direction import OneDirection, align_across
 from semcal_ros.core.registration.periodicity import choose_period
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
-from semcal_ros.core.registration.specimen import keep_specimen, look_at_whole
+from semcal_ros.core.registration.specimen import (
+    keep_specimen,
+    look_at_whole,
+    refuse_unless_followed,
+)
 from semcal_ros.core.registration.tiles import Pyramid, make_level
 
 __all__ = [
@@ -476,6 +480,9 @@ def _register_across(
     if rejection is None and whole is not None and whole.share < _MUCH_AGREES:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
+    follow_px = limits.follow_px((np.shape(image)[1], np.shape(image)[0]), inside)
+    if rejection is None and follow_px is not None:
+        rejection = refuse_unless_followed(reference, alignment, image_noise, follow_px)
     moved = replace(alignment, shift_px=alignment.shift_px + origin)
     return Registration(moved, correlation, rejection, along=lines.along)
 
@@ -511,6 +518,13 @@ def _register(
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
     least = reference.settings.min_competing_height * peaks[0].correlation
     repeats = len(peaks) > 1 and peaks[1].correlation >= least and len(reference.periods) > 0
+    follow_px = reference.settings.follow_px((np.shape(image)[1], np.shape(image)[0]), inside)
+    if repeats and follow_px is not None:
+        # What moves otherwise would choose the period, and the lattice agrees with any.
+        return _reject(
+            MatchFailure.AMBIGUOUS,
+            "ambiguous: a specimen that repeats, so that a part of it does not say by how many periods it moved",
+        )
     chosen: tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]
     if repeats:
         finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True) or peaks
@@ -545,8 +559,6 @@ def _register(
     whole = None if repeats or of_parts else look_at_whole(reference, alignment, image_noise)
     kept = None
     if not repeats and (whole is None or not whole.is_complete):
-        size = np.shape(image)[1], np.shape(image)[0]
-        follow_px = reference.settings.follow_px(size, inside)
         kept = keep_specimen(reference, pyramid, alignment, peak, peaks, guess, spread, follow_px)
     if kept is None and isinstance(chosen, Rejection):
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]

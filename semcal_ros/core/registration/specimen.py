@@ -46,7 +46,7 @@ from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["keep_specimen", "look_at_whole"]
+__all__ = ["keep_specimen", "look_at_whole", "refuse_unless_followed"]
 
 # Of a shift that is the specimen's by itself, and at least, with a prediction.
 _MOST_AGREES, _LEAST_SHARE = 0.85, 0.1
@@ -161,7 +161,7 @@ def keep_specimen(
     shown = moving if moving.share > 0.0 else None
     share = best.agreement.share
     if follow_px is not None:
-        share = _share_inside(best, reference, follow_px)
+        share = _share_inside(best.alignment, best.agreement, reference, follow_px)
     return best.alignment, best.start, shown, share
 
 
@@ -169,29 +169,44 @@ def _choose_followed(
     found: list[_Hypothesis], reference: Reference, follow_px: Region
 ) -> _Hypothesis | Rejection[MatchFailure]:
     """The shift with which a part of the image agrees."""
-    shares = [_share_inside(hypothesis, reference, follow_px) for hypothesis in found]
+    shares = [_share_inside(h.alignment, h.agreement, reference, follow_px) for h in found]
     best = int(np.argmax(shares))
-    if shares[best] > _MOST_AGREES:
-        return found[best]
+    return found[best] if shares[best] > _MOST_AGREES else _not_followed(shares[best])
+
+
+def refuse_unless_followed(
+    reference: Reference, alignment: Alignment, image_noise: float, follow_px: Region
+) -> Rejection[MatchFailure] | None:
+    """Return why an alignment is not that of a part of the image; None if it is."""
+    agreement = look_at_whole(reference, alignment, image_noise)
+    share = 0.0
+    if agreement is not None:
+        share = _share_inside(alignment, agreement, reference, follow_px)
+    return None if share > _MOST_AGREES else _not_followed(share)
+
+
+def _not_followed(share: float) -> Rejection[MatchFailure]:
     return Rejection(
         MatchFailure.AMBIGUOUS,
-        f"ambiguous: {100.0 * max(shares[best], 0.0):.0f} % of the structure of the part to follow moves by one shift",
+        f"ambiguous: {100.0 * max(share, 0.0):.0f} % of the structure of the part to follow moves by one shift",
     )
 
 
-def _share_inside(found: _Hypothesis, reference: Reference, part: Region) -> float:
+def _share_inside(
+    alignment: Alignment, agreement: Agreement, reference: Reference, part: Region
+) -> float:
     """Part of the structure inside a rectangle of the image that agrees with a shift; 0 without structure there."""
-    statistics, level = found.alignment.tile_statistics(), reference.levels[-1]
+    statistics, level = alignment.tile_statistics(), reference.levels[-1]
     assert statistics is not None
-    corner, side = _first_corner(reference, statistics, found), level.side
-    rows, cols = found.agreement.disagrees.shape
+    corner, side = _first_corner(reference, statistics, alignment), level.side
+    rows, cols = agreement.disagrees.shape
     x, y = (
         corner[axis] + (np.arange(count) + 0.5) * side[axis]
         for axis, count in ((0, cols), (1, rows))
     )
     inside = np.outer((y >= part[1]) & (y < part[3]), (x >= part[0]) & (x < part[2]))
-    weight = np.trace(statistics.gradient, axis1=-2, axis2=-1) * found.agreement.informs * inside
-    agreeing = float(weight[~found.agreement.disagrees].sum())
+    weight = np.trace(statistics.gradient, axis1=-2, axis2=-1) * agreement.informs * inside
+    agreeing = float(weight[~agreement.disagrees].sum())
     return agreeing / max(float(weight.sum()), 1e-30)
 
 
@@ -226,15 +241,15 @@ def _moving_tiles(
     reference: Reference, statistics: TileStatistics, found: _Hypothesis
 ) -> MovingTiles:
     side = np.array(reference.levels[-1].side, dtype=np.float64)
-    corner = _first_corner(reference, statistics, found)
+    corner = _first_corner(reference, statistics, found.alignment)
     return MovingTiles.of(found.agreement.disagrees, corner, side)
 
 
-def _first_corner(reference: Reference, statistics: TileStatistics, found: _Hypothesis) -> Array:
+def _first_corner(reference: Reference, statistics: TileStatistics, alignment: Alignment) -> Array:
     """(2,) left and top of the first tile in the image."""
     level = reference.levels[-1]
     first = np.array([statistics.cols.start, statistics.rows.start])
-    return np.array(level.origin) + first * np.array(level.side) + found.alignment.shift_px
+    return np.array(level.origin) + first * np.array(level.side) + alignment.shift_px
 
 
 def _estimate_least_noise(image: AnyImage) -> float:

@@ -24,6 +24,7 @@ from semcal_ros.core.drift.estimates import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.reference import RegistrationSettings
+from semcal_ros.core.registration.register import prepare_reference, register
 
 
 def test_a_tool_that_was_there_from_the_start_is_left_out_where_the_specimen_is_known() -> None:
@@ -61,3 +62,26 @@ def test_a_part_that_is_no_rectangle_of_the_picture_is_an_error(
 ) -> None:
     with pytest.raises(InvalidValueError, match="part to follow"):
         RegistrationSettings(follow=part)
+
+
+def test_a_tool_does_not_choose_the_period_of_a_lattice() -> None:
+    frames, drift, _ = draw(KINDS["tool over a lattice"], 100)
+    reference = prepare_reference(frames[0])
+    for k in (3, 6, 10, 14, 20):
+        found = register(reference, frames[k], guess_px=drift[k], guess_covariance=4.0 * np.eye(2))
+        if found.accepted:
+            assert np.max(np.abs(found.shift_px - drift[k])) < 0.1
+        # The tool comes in with the sixth frame.
+        assert found.accepted is (k < 6), found.reason
+
+
+def test_a_part_of_a_lattice_to_follow_is_refused() -> None:
+    frames, drift, _ = draw(KINDS["lattice"], 100)
+    settings = RegistrationSettings(follow=(0.6, 0.0, 1.0, 1.0))
+    found = register(
+        prepare_reference(frames[0], settings=settings),
+        frames[3],
+        guess_px=drift[3],
+        guess_covariance=4.0 * np.eye(2),
+    )
+    assert "by how many periods" in found.reason

@@ -49,7 +49,12 @@ from semcal_ros.core.calibration.estimator.variance_components import update_com
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices, mark_untilted
-from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
+from semcal_ros.core.calibration.views import (
+    GridView,
+    add_excess_noise,
+    estimate_excess_sigma_px,
+    refuse_tilted_lines,
+)
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
     CalibrationModel,
@@ -144,10 +149,11 @@ def make_setup(
     Raises
     ------
     CalibrationError
-        If no view lies in the calibrated range.
+        If no view lies in the calibrated range, or one of a grating is tilted.
     InvalidValueError
         If an untilted view is named that is not there.
     """
+    refuse_tilted_lines(views)
     low, high = model.magnification_range
     inside = [v for v in views if low * (1 - 1e-9) <= v.magnification <= high * (1 + 1e-9)]
     if not inside:
