@@ -526,7 +526,7 @@ class _BagRecording(Recording):
                 pixels, _ = decoded_image(self._reader.decode(raw))
             except SemcalError:
                 continue
-            if np.ptp(pixels[: len(pixels) // 2]) == 0:
+            if np.ptp(pixels[: (len(pixels) + 1) // 2]) == 0:
                 # A blanked beam: there is nothing that a bar would differ from.
                 continue
             found.append(find_databar(pixels))

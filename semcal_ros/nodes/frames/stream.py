@@ -288,7 +288,7 @@ class FrameInput:
         """Warn of a data bar that the configuration does not tell of, at the first image of a size."""
         if self._lines is None or self._databar_rows or image.shape == self._looked_at:
             return
-        upper = image[: len(image) // 2]
+        upper = image[: (len(image) + 1) // 2]
         if upper.min() == upper.max():
             # A blanked beam: there is nothing that a bar would differ from.
             return

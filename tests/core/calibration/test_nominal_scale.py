@@ -111,7 +111,9 @@ def _lose_the_first_corner(result):
     ("spoil", "told"),
     [
         (
-            lambda result: replace(result, status=DescentStatus.ITERATION_LIMIT),
+            lambda result: replace(
+                result, status=DescentStatus.ITERATION_LIMIT, last_decrease=1e-3
+            ),
             "did not converge .stopped at the iteration limit",
         ),
         (_lose_the_first_corner, "cannot show corners of"),
