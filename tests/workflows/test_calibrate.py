@@ -320,7 +320,7 @@ def test_options_win_over_the_configuration():
     assert options_for(replace(config, stage=None)).axis == StageAxis()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
     off = CalibrationOptions(residual="off")
     plain = calibrate_recording(_recorded(tmp_path / "plain", only=1000.0), options=off)

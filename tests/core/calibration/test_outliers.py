@@ -51,7 +51,7 @@ def _misnamed(views, index, factor):
     [
         ("strong_perspective", 1.06, 10),
         pytest.param("parallel", 0.94, 10, marks=pytest.mark.long),
-        ("parallel", 1.06, 11),
+        pytest.param("parallel", 1.06, 11, marks=pytest.mark.long),
     ],
 )
 def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):

@@ -90,8 +90,10 @@ def with_field():
 
 @pytest.mark.parametrize(
     ("microscope", "terms"),
-    [(preset("scan_nonlinear"), "settling"), (FADING, "xi_s")],
-    ids=["coils and settling", "a spiral that fades"],
+    [
+        pytest.param(preset("scan_nonlinear"), "settling", id="coils and settling"),
+        pytest.param(FADING, "xi_s", id="a spiral that fades", marks=pytest.mark.long),
+    ],
 )
 def test_terms_describe_coils_settling_and_spiral_without_a_field(microscope, terms):
     result = _calibrate(microscope, "auto")

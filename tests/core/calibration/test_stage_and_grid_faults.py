@@ -107,7 +107,7 @@ def test_a_wavy_grid_is_the_grids_and_no_residual_field():
     assert_honest(result)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bowed_stretched_and_sheared_grid_is_estimated():
     grid = GridFaults(stretch=2e-3, shear=1e-3, curvature=20.0)
     stage = replace(ONE_AXIS, reading_sigma_rad=0.003)
@@ -171,7 +171,7 @@ def test_the_spread_of_visits_comes_out():
     assert min(np.array(camera.pixel_size_sigma_m) / camera.pixel_size_m) > said["repeatability"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hysteresis_is_named():
     """Magnifications reached from below show 0.5 % more than from above."""
     upwards = (*UPWARDS[:-1], 8500.0, 9300.0, UPWARDS[-1])

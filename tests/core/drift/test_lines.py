@@ -76,6 +76,7 @@ def test_across_is_measured_and_along_is_honestly_predicted(
     assert np.all(np.diff(free) > 0.0)
 
 
+@pytest.mark.long
 def test_a_tool_that_comes_in_does_not_tell_the_drift_along_scratches() -> None:
     frames, drift, _ = draw(KINDS["tool over scratches"], 101)
     tracker = DriftTracker()
