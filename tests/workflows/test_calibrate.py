@@ -146,7 +146,7 @@ def test_a_view_at_a_wrong_magnification_is_named(found):
     assert len(done.collected.views) == len(done.collected.found) == len(found[0]) - 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_slightly_wrong_magnification_is_named_after_the_adjustment(found):
     wrong = found[0][6]
     # One view among four of the same magnification whose scale is 5 % off: 1 mm of height.

@@ -92,9 +92,10 @@ def with_field():
     ("microscope", "terms"),
     [
         pytest.param(preset("scan_nonlinear"), "settling", id="coils and settling"),
-        pytest.param(FADING, "xi_s", id="a spiral that fades", marks=pytest.mark.long),
+        pytest.param(FADING, "xi_s", id="a spiral that fades"),
     ],
 )
+@pytest.mark.long
 def test_terms_describe_coils_settling_and_spiral_without_a_field(microscope, terms):
     result = _calibrate(microscope, "auto")
     assert result.model.residual is None
@@ -130,6 +131,7 @@ def test_the_field_leaves_the_rest_of_the_model_alone(with_field):
         assert np.abs(overlap).max() < 0.02
 
 
+@pytest.mark.long
 def test_a_microscope_without_such_distortion_is_not_made_worse():
     ordinary = preset("jsm820")
     auto, on = calibrated("jsm820"), calibrated("jsm820", CalibrationOptions(residual="on"))

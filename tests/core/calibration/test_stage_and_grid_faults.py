@@ -208,7 +208,7 @@ def _read(views, **changed):
     return out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tilt_that_contradicts_the_image_is_named_and_not_used():
     stage = replace(ONE_AXIS, reading_sigma_rad=0.003, miss_m=(1.6e-4, 0.0))
     views = views_of(stage, seed=9, readings=True)

@@ -119,7 +119,7 @@ def test_beyond_the_range_the_truth_is_within_what_is_stated(name: str) -> None:
     assert np.abs(z).max() > 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_tilts_the_scale_is_as_uncertain_as_the_height() -> None:
     """Without tilt a height is a scale; what is left is how well views keep their height."""
     sem = preset("jsm820")
