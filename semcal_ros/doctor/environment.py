@@ -33,8 +33,8 @@ from semcal_ros.middleware.ament_prefix import prefixes_of_user
 __all__ = ["collect_environment"]
 
 _MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
-# Importing rclpy loads the middleware, which may end the process at once: a separate process does it.
 _PREFIXES = "AMENT_PREFIX_PATH"
+# Importing rclpy loads the middleware, which may end the process at once: a separate process does it.
 _PROBE = (
     f"import os, rclpy; print(os.environ.get('{_PREFIXES}', '')); print(rclpy.__file__); "
     "print(rclpy.get_rmw_implementation_identifier())"

@@ -47,7 +47,7 @@ from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.bags.stage import find_stage
 from semcal_ros.files.bags.topics import find_image_topic, find_topic
-from semcal_ros.files.images.databar import find_databar
+from semcal_ros.files.images.databar import find_databar, is_blank_above
 from semcal_ros.files.images.image_series import (
     ImageSeries,
     SeriesImage,
@@ -526,8 +526,7 @@ class _BagRecording(Recording):
                 pixels, _ = decoded_image(self._reader.decode(raw))
             except SemcalError:
                 continue
-            if np.ptp(pixels[: (len(pixels) + 1) // 2]) == 0:
-                # A blanked beam: there is nothing that a bar would differ from.
+            if is_blank_above(pixels):
                 continue
             found.append(find_databar(pixels))
             if len(found) == _LOOKED_AT or not found[-1]:

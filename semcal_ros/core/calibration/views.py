@@ -437,7 +437,7 @@ def add_excess_noise(views: Sequence[GridView], sigma_px: float) -> tuple[GridVi
 
 
 def refuse_tilted_lines(views: Sequence[GridView]) -> None:
-    """Raise :class:`CalibrationError` where the stage tilts a grating among the views: they must be flat, or be grids.
+    """Refuse views that the stage tilts where any of them shows parallel lines, which do not tell a tilt.
 
     Raises
     ------

@@ -25,13 +25,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["find_databar"]
+__all__ = ["find_databar", "is_blank_above"]
 
 # Part of a row that has its commonest value: in bars at least a half, but where text is dense; in pictures of 8 bits at
 # most a third, but where they are clipped.
 _OF_BAR, _OF_BAR_TYPICALLY, _OF_PICTURE = 0.45, 0.6, 0.4
 # Rows of a bar, at least and as a part of the picture at most.
 _FEWEST, _LARGEST_PART = 8, 0.25
+
+
+def is_blank_above(image: NDArray[Any]) -> bool:
+    """Whether the upper half of an image is even, as of a blanked beam: a bar would differ from nothing there."""
+    upper = image[: (len(image) + 1) // 2]
+    return bool(upper.min() == upper.max())
 
 
 def find_databar(image: NDArray[Any]) -> int:

@@ -36,7 +36,7 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
-from semcal_ros.files.images.databar import find_databar
+from semcal_ros.files.images.databar import find_databar, is_blank_above
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
@@ -288,9 +288,7 @@ class FrameInput:
         """Warn of a data bar that the configuration does not tell of, at the first image of a size."""
         if self._lines is None or self._databar_rows or image.shape == self._looked_at:
             return
-        upper = image[: (len(image) + 1) // 2]
-        if upper.min() == upper.max():
-            # A blanked beam: there is nothing that a bar would differ from.
+        if is_blank_above(image):
             return
         self._looked_at = image.shape
         rows = find_databar(image)
