@@ -33,7 +33,8 @@ __all__ = ["LinePhase", "LinePhaseCorrector", "estimate_line_phase", "remove_lin
 
 # Largest phase that is looked for, part of the width: lags are some microseconds, and lines take a millisecond.
 _LARGEST = 1.0 / 16.0
-# Lines that are compared with their neighbours, up to twice as many: they tell the phase of gold at 30 electrons to 0.02 px.
+# Lines that are compared with their neighbours, up to twice as many: they tell the phase of gold at 30 electrons to
+# 0.02 px.
 _MOST_LINES = 128
 # 1-sigma of the smoothing along the lines, px: noise of single pixels tells nothing.
 _SMOOTH_PX = 1.0
