@@ -79,6 +79,10 @@ def _read_whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+def _read_auto(value: Any) -> Any:
+    return None if value == "auto" else value
+
+
 def _read_unit(value: Any) -> Any:
     # YAML reads the unit 1 as a number; True equals 1 too.
     return "1" if isinstance(value, (int, float)) and value == 1 and value is not True else value
@@ -156,7 +160,7 @@ class ImageConfig:
     stamp
         The moment of the acquisition that the header stamp means.
     databar_rows
-        Rows at the bottom that show text instead of the specimen.
+        Rows at the bottom that show text instead of the specimen; None, or ``auto`` in a file, to find them.
     """
 
     topic: _Topic = Field(default="image_raw", description=_TOPIC)
@@ -167,9 +171,13 @@ class ImageConfig:
         default="start",
         description="start, centre or end, the moment of the acquisition that is stamped",
     )
-    databar_rows: Annotated[int, Field(strict=True, ge=0, le=100_000), _Whole] = Field(
-        default=0, description="the number of rows of the data bar, 0 to 100000"
-    )
+    databar_rows: Annotated[
+        Annotated[int, Field(strict=True, ge=0, le=100_000), _Whole] | None,
+        BeforeValidator(
+            _read_auto,
+            json_schema_input_type=Annotated[int, Field(ge=0, le=100_000)] | Literal["auto"],
+        ),
+    ] = Field(default=None, description="auto, or the number of rows of the data bar, 0 to 100000")
 
 
 @_refuse_in_one_line

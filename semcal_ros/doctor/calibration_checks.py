@@ -29,12 +29,12 @@ __all__ = ["check_calibration", "describe_calibration", "live_size"]
 _ASPECT = 1e-3
 
 
-def live_size(session: Session, config: MicroscopeConfig) -> tuple[int, int] | None:
+def live_size(session: Session) -> tuple[int, int] | None:
     """Return the width and height of the live images without their data bar, px, or None."""
     image = session.image
-    if image is None or image.height <= config.image.databar_rows:
+    if image is None or image.height <= image.databar_rows:
         return None
-    return image.width, image.height - config.image.databar_rows
+    return image.width, image.height - image.databar_rows
 
 
 def describe_calibration(

@@ -169,7 +169,7 @@ def judge_calibrations(
     magnification = describe_magnifications(session, effective)
     g = None if magnification is None else magnification.value
     found += check_magnification(topic, magnification, session)
-    size = live_size(session, config)
+    size = live_size(session)
     seen = None if used is None else describe_calibration(*used, g, size)
     found += check_calibration(seen, size, g, config)
     if given and live and given[1].dumps() != live[1].dumps():

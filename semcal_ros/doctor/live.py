@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
@@ -34,7 +35,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.bridge.headers import optional_stamp_ns
-from semcal_ros.bridge.images import image_from_message, without_databar
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.config.config import MicroscopeConfig
@@ -45,10 +45,10 @@ from semcal_ros.doctor.observations import (
     Arrival,
     Endpoint,
     Graph,
-    ImageSeen,
     Session,
     Status,
 )
+from semcal_ros.doctor.stream_checks import describe_image
 from semcal_ros.middleware.message_types import message_class
 
 __all__ = ["observe"]
@@ -62,6 +62,8 @@ _ANSWER_S = 5.0
 _STEP_S = 0.05
 # Messages that may wait while others are handled. Chosen, not measured.
 _DEPTH = 50
+# As many images as tell whether they have a data bar.
+_LOOKED_AT = 2
 _PARAMETERS = ("use_sim_time", "config")
 
 
@@ -112,7 +114,7 @@ class _Observer:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._arrivals: dict[str, list[Arrival]] = {}
-        self._image: Any = None
+        self._images: deque[Any] = deque(maxlen=_LOOKED_AT)
         self._magnification: Any = None
         self._stage: Any = None
         self._conditions: dict[str, float | str] | None = None
@@ -152,7 +154,7 @@ class _Observer:
             seconds=seconds,
             graph=replace(graph, parameters=values),
             arrivals={name: tuple(heard) for name, heard in self._arrivals.items()},
-            image=self._describe_image(),
+            image=describe_image(self._images, self._config),
             reading=reading,
             reading_trouble=trouble,
             stage=stage,
@@ -209,7 +211,7 @@ class _Observer:
         return take
 
     def _take_image(self, message: Any) -> None:
-        self._image = message
+        self._images.append(message)
 
     def _take_magnification(self, message: Any) -> None:
         self._magnification = message
@@ -229,18 +231,6 @@ class _Observer:
             if name != status.name and name.rpartition("/")[0] == self._namespace:
                 level = int.from_bytes(status.level, "little")
                 self._statuses[name] = Status(name, level, status.message)
-
-    def _describe_image(self) -> ImageSeen | None:
-        message, trouble = self._image, ""
-        # Only uncompressed images show their size without being decoded.
-        if message is None or not hasattr(message, "encoding"):
-            return None
-        try:
-            without_databar(image_from_message(message), self._config.image.databar_rows)
-        except SemcalError as error:
-            trouble = str(error)
-        size = len(message.data)
-        return ImageSeen(message.width, message.height, message.encoding, size, trouble)
 
     def _reading(self) -> tuple[MagnificationReading | None, str]:
         if self._magnification is None:

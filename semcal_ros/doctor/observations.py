@@ -146,13 +146,14 @@ class Arrival:
 
 @dataclass(frozen=True)
 class ImageSeen:
-    """The last image: px, encoding, bytes, and why it cannot be used (empty if it can)."""
+    """The last image: px, encoding, bytes, why it cannot be used (empty if it can), and the rows of its data bar."""
 
     width: int
     height: int
     encoding: str
     bytes: int
     trouble: str = ""
+    databar_rows: int = 0
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@
 from __future__ import annotations
 
 import struct
+from collections import deque
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from semcal_ros.bridge.conditions import read_conditions
-from semcal_ros.bridge.images import image_from_message, without_databar
 from semcal_ros.bridge.magnification import read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.calibration import Calibration
@@ -33,12 +33,13 @@ from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import judge_calibrations
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.graph_checks import CONDITIONS, Topic, suite_topics
-from semcal_ros.doctor.observations import Arrival, Endpoint, Graph, ImageSeen, Session
+from semcal_ros.doctor.observations import Arrival, Endpoint, Graph, Session
 from semcal_ros.doctor.stream_checks import (
     check_conditions,
     check_images,
     check_stage,
     check_stamps,
+    describe_image,
 )
 from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag
 from semcal_ros.files.bags.topics import topic_matches
@@ -139,6 +140,8 @@ def _read(
     held = {t.name for t in bag.topics if wanted.get(t.name) == t.type}
     arrivals: dict[str, list[Arrival]] = {name: [] for name in held}
     last: dict[str, RawMessage] = {}
+    # As many images as tell whether they have a data bar.
+    newest: deque[RawMessage] = deque(maxlen=2)
     early = 0
     for raw in bag.raw_messages(held):
         begins_with_stamp = raw.topic != namespace and _has_header(raw.type)
@@ -146,10 +149,13 @@ def _read(
         arrivals[raw.topic].append(Arrival(raw.log_time_ns, None, stamp_ns))
         early += raw.topic == images.name and magnification.name not in last
         last[raw.topic] = raw
+        if raw.topic == images.name:
+            newest.append(raw)
     session = Session(
         seconds=bag.duration_s,
         graph=Graph(publishers={t.name: (Endpoint(_RECORDING, t.type),) for t in bag.topics}),
         arrivals={name: tuple(heard) for name, heard in arrivals.items()},
+        image=describe_image([bag.decode(raw) for raw in newest], config),
     )
     messages = {name: bag.decode(raw) for name, raw in last.items()}
     session = _with_readings(session, messages, topics, config)
@@ -173,17 +179,7 @@ def _with_readings(
     topics: tuple[Topic, ...],
     config: MicroscopeConfig,
 ) -> Session:
-    images, magnification = topics[:2]
-    image = messages.get(images.name)
-    if image is not None and hasattr(image, "encoding"):
-        trouble = ""
-        try:
-            without_databar(image_from_message(image), config.image.databar_rows)
-        except SemcalError as error:
-            trouble = str(error)
-        size = int(image.data.size)
-        seen = ImageSeen(int(image.width), int(image.height), image.encoding, size, trouble)
-        session = replace(session, image=seen)
+    magnification = topics[1]
     if magnification.name in messages:
         try:
             reading = read_magnification(messages[magnification.name], config)

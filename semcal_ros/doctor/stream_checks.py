@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import Any
 
+from semcal_ros.bridge.images import image_from_message
 from semcal_ros.bridge.stage import missing_joints
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
@@ -30,7 +32,8 @@ from semcal_ros.core.errors import SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic
-from semcal_ros.doctor.observations import Arrival, Session
+from semcal_ros.doctor.observations import Arrival, ImageSeen, Session
+from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.transport_advice import transport_advice
 
 __all__ = [
@@ -44,6 +47,7 @@ __all__ = [
     "check_stage",
     "check_stamps",
     "check_transport_time",
+    "describe_image",
     "describe_magnifications",
     "rate_hz",
 ]
@@ -57,6 +61,30 @@ _SLOW_S = 1.0
 # From the stamp to arrival. It includes the scan, which may take longer than this: hence a note.
 _OLD_S = 5.0
 _SYNCHRONISE = "synchronise the clocks of the hosts (chrony or NTP)"
+
+
+def describe_image(messages: Sequence[Any], config: MicroscopeConfig) -> ImageSeen | None:
+    """Describe the last of some images, which tell a data bar together; None for compressed ones.
+
+    Only uncompressed images show their size without being decoded.
+    """
+    if not messages or not hasattr(messages[-1], "encoding"):
+        return None
+    trouble, databar = "", DatabarCutter(config.image.databar_rows)
+    try:
+        for message in messages:
+            databar.cut(image_from_message(message))
+    except SemcalError as error:
+        trouble = str(error)
+    last = messages[-1]
+    return ImageSeen(
+        int(last.width),
+        int(last.height),
+        str(last.encoding),
+        len(last.data),
+        trouble,
+        databar.rows,
+    )
 
 
 def rate_hz(arrivals: tuple[Arrival, ...]) -> float | None:

@@ -54,7 +54,7 @@ def _make_folder(config: MicroscopeConfig, settings: Settings) -> FrameSource:
         backlog=settings["backlog"],
         stamps=settings["stamps"],
         field_width_m=lambda: float(settings["field_width_m"]),
-        keep_databar=config.image.databar_rows > 0,
+        keep_databar=config.image.databar_rows is not None,
     )
 
 

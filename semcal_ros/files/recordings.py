@@ -47,7 +47,7 @@ from semcal_ros.files.bags.magnifications import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.bags.stage import find_stage
 from semcal_ros.files.bags.topics import find_image_topic, find_topic
-from semcal_ros.files.images.databar import find_databar, is_blank_above
+from semcal_ros.files.images.databar import DatabarFinder
 from semcal_ros.files.images.image_series import (
     ImageSeries,
     SeriesImage,
@@ -77,8 +77,8 @@ T = TypeVar("T")
 ENCODINGS = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
 
 
-# Images of a bag in which a data bar is looked for, and the first ones among which they are.
-_LOOKED_AT, _AMONG = 3, 30
+# The first images of a bag, in which a data bar is looked for until one can be told.
+_AMONG = 30
 # Beyond these, a unit was forgotten: from a tenth of a picometre, far below an atom, to a metre for
 # the pixel of a photograph; from a photographed wall to what bags accept; from a microsecond, which
 # no raster scan reaches, to the time limit of a configuration's frame.
@@ -497,7 +497,8 @@ class _BagRecording(Recording):
         super().__init__(path, config, roi=given.roi, mask=given.mask)
         self._given = given
         rows = given.databar_rows
-        self._databar_rows = config.image.databar_rows if rows is None else rows
+        stated = config.image.databar_rows if rows is None else rows
+        self._databar_rows = stated or 0
         self._reader = open_bag(path)
         self._track: MagnificationTrack | None = None
         try:
@@ -515,27 +516,24 @@ class _BagRecording(Recording):
         self._notes.extend(notes)
         self._conditions = find_conditions(self._reader, self._image_topic.name)
         self._moved = 0
-        if rows is None and self._databar_rows == 0:
+        if stated is None:
             self._cut_databar()
 
     def _cut_databar(self) -> None:
-        """Find a bar of text that the configuration does not tell of in some images, and note it."""
-        found: list[int] = []
+        """Find a bar of text that nobody stated as a node does that receives these images, and note it."""
+        finder = DatabarFinder()
         for raw in islice(self._reader.raw_messages([self._image_topic.name]), _AMONG):
             try:
                 pixels, _ = decoded_image(self._reader.decode(raw))
             except SemcalError:
                 continue
-            if is_blank_above(pixels):
-                continue
-            found.append(find_databar(pixels))
-            if len(found) == _LOOKED_AT or not found[-1]:
+            finder.look(pixels)
+            if finder.rows is not None:
                 break
-        if found and found[0] and len(set(found)) == 1:
-            self._databar_rows = found[0]
+        if finder.candidate:
+            self._databar_rows = finder.candidate
             self._notes.append(
-                f"the lowest {found[0]} rows are a data bar and are cut off; --databar-rows 0 keeps them, and nodes "
-                f"cut them off where the configuration has image.databar_rows: {found[0]}"
+                f"the lowest {finder.candidate} rows are a data bar and are cut off; --databar-rows 0 keeps them"
             )
 
     def _find_magnification(self, source: MagnificationConfig) -> BagTopic | None:
@@ -812,8 +810,8 @@ class _ImageRecording(Recording):
 def open_image_series(given: RecordedFiles, config: MicroscopeConfig) -> ImageSeries:
     """Collect image files as one series, read with this configuration.
 
-    Its display width is what magnifications refer to, and its databar rows, if not 0, are used in
-    place of what the files say.
+    Its display width is what magnifications refer to, and its databar rows, if it states them, are used in place of
+    what the files say.
 
     Raises
     ------
@@ -825,7 +823,7 @@ def open_image_series(given: RecordedFiles, config: MicroscopeConfig) -> ImageSe
     return list_image_series(
         paths,
         display_width_m=config.display_width_m,
-        databar_rows=config.image.databar_rows or None if rows is None else rows,
+        databar_rows=config.image.databar_rows if rows is None else rows,
         pixel_size_m=given.pixel_size_m,
         magnification=given.magnify(config.display_width_m),
         frame_interval_s=given.frame_interval_s,

@@ -316,7 +316,7 @@ class VirtualSem(SemNode):
         return microscope.with_image_size(self.parameters["width"], self.parameters["height"])
 
     def _detector(self, bits: int) -> Detector:
-        return Detector(bits=bits, databar_rows=self.config.image.databar_rows)
+        return Detector(bits=bits, databar_rows=self.config.image.databar_rows or 0)
 
     def _stage_with_faults(self) -> SimulatedStage:
         name = self.parameters["stage"]

@@ -120,12 +120,6 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         "check beam blank, shutter and detector",
     ),
     (
-        r"the lowest (\d+) rows look like a data bar: .*",
-        _WARN,
-        r"gets pictures whose lowest \1 rows look like a data bar",
-        "set image.databar_rows in the configuration, so that they are cut off",
-    ),
-    (
         r"odd lines are shifted against even ones by (.*) px, .*",
         _WARN,
         r"gets pictures whose odd lines are shifted against the even ones by \1 px",

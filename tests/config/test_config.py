@@ -137,7 +137,7 @@ def test_the_manual_lists_the_declared_keys_with_their_defaults_and_units() -> N
         elif key in mappings:
             assert default.startswith("none"), key
         elif said.get("default") is None:
-            assert default.startswith(("none", "width of the frames")), key
+            assert default.startswith(("none", "width of the frames", "auto")), key
         else:
             assert load_yaml(default, key) == load_yaml(str(said["default"]) or '""', key), key
 

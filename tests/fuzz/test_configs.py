@@ -74,7 +74,7 @@ def _check(config: MicroscopeConfig) -> None:
     assert all(isinstance(number, float) and math.isfinite(number) for number in numbers)
     assert config.display_width_m > 0.0
     assert config.start_offset_s <= 0.0
-    assert isinstance(config.image.databar_rows, int)
+    assert config.image.databar_rows is None or type(config.image.databar_rows) is int
     assert list(config.squares_m) == sorted(config.squares_m, reverse=True)
     assert json.dumps(asdict(config), allow_nan=False)
     message = SimpleNamespace(data=500.0, a=SimpleNamespace(b=[1.0, 2.0]))

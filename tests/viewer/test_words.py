@@ -48,11 +48,6 @@ STATES = {
     "3 frames dropped or rejected": ("warn", "3 of the last frames", "if it goes on"),
     "last rejection: encoding bgra8, expected mono8": ("warn", "bgra8, expected mono8", "correct"),
     "uncalibrated": ("warn", "nominal", "calibrate"),
-    "the lowest 40 rows look like a data bar: set image.databar_rows": (
-        "warn",
-        "lowest 40 rows",
-        "set image",
-    ),
     "odd lines are shifted against even ones by 2.00 +- 0.01 px, as in a bidirectional scan or an interlaced video: "
     "declare bidirectional: true under scan in the configuration": (
         "warn",

@@ -101,7 +101,7 @@ class ViewRecorder:
         Parameters
         ----------
         image
-            (h, w) or (h, w, 3) without data bar; the recording has a black one where the configuration has one.
+            (h, w) or (h, w, 3) without data bar; the recording has a black one where the configuration states one.
         encoding
             As in sensor_msgs/Image.
         stamp_ns
@@ -132,7 +132,7 @@ class ViewRecorder:
         self._writer.write(microscope_topic(config.image.topic), stamp_ns, message)
 
     def _with_databar(self, image: AnyImage) -> AnyImage:
-        rows = self._config.image.databar_rows
+        rows = self._config.image.databar_rows or 0
         blank = np.zeros((rows, *image.shape[1:]), dtype=image.dtype)
         return np.concatenate([image, blank]) if rows else image
 

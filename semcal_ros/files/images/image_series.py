@@ -36,7 +36,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError, UnknownScaleError
 from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.bags.reader import is_bag
-from semcal_ros.files.images.databar import find_databar
+from semcal_ros.files.images.databar import DatabarFinder
 from semcal_ros.files.images.image_file import (
     ImageFile,
     ImagePage,
@@ -503,12 +503,12 @@ def _cut_databars(
     firsts = {id(image.file): image for image in reversed(images)}
     untold = [image for image in firsts.values() if image.databar_rows == 0]
     looked = untold[:: max(1, len(untold) // _LOOKED_AT)][:_LOOKED_AT]
-    rows: dict[tuple[int, int], list[int]] = {}
+    finders: dict[tuple[int, int], DatabarFinder] = {}
     stored = ImageSeries(tuple(looked), display_width_m, (), ())
     for image, pixels in stored.read():
         if isinstance(pixels, np.ndarray):
-            rows.setdefault(image.page.size_px, []).append(find_databar(pixels))
-    bars = {size: found[0] for size, found in rows.items() if len(set(found)) == 1 and found[0]}
+            finders.setdefault(image.page.size_px, DatabarFinder()).look(pixels)
+    bars = {size: finder.candidate for size, finder in finders.items() if finder.candidate}
     if not bars:
         return images, []
     cut = tuple(

@@ -28,13 +28,14 @@ from rclpy.serialization import deserialize_message
 
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.bridge.images import to_gray, without_databar
+from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Verdict
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection, SemcalError
+from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.latest_worker import LatestWorker
@@ -111,7 +112,7 @@ class CalibrationMonitor:
         calibration: Callable[[], tuple[Calibration | None, MicroscopeConfig]],
         period_s: float,
     ) -> None:
-        self._rows = config.image.databar_rows
+        self._databar = DatabarCutter(config.image.databar_rows)
         self._reporter = reporter
         self._magnification = magnification
         self._calibration = calibration
@@ -137,7 +138,9 @@ class CalibrationMonitor:
         try:
             message = deserialize_message(data, self._type)
             pixels, encoding = decoded_image(message)
-            image = without_databar(pixels, self._rows)
+            image = self._databar.cut(pixels)
+            if image is None:
+                return
             times = stamp_ns_from_msg(message), published_ns(info)
             g = self._magnification.at(*times, image.shape[1], config)
             if g is None or self._magnification.changed_during(*times):

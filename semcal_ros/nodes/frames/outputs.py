@@ -124,7 +124,7 @@ class RectifiedOutput:
         reporter: Reporter,
     ) -> None:
         self._reporter = reporter
-        self._databar_rows = config.image.databar_rows
+        self._databar_rows = 0
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
         beside, own = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
         matrix = "projection_stamped"
@@ -173,6 +173,7 @@ class RectifiedOutput:
 
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None if the image has no camera."""
+        self._databar_rows = frame.databar_rows
         # The camera first: a subscriber that has the image can then use it at once.
         for publisher, output in self._where_awaited:
             if publisher.is_awaited:

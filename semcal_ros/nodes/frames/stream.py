@@ -30,13 +30,12 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.bridge.images import without_databar
 from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
-from semcal_ros.files.images.databar import find_databar, is_blank_above
+from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
@@ -91,6 +90,8 @@ class StreamFrame:
         (h, w) or (h, w, 3) without data bar, read-only.
     encoding, header
         As received.
+    databar_rows
+        Rows that the microscope's image has below this one.
     stamp_ns
         Stamp of the header.
     magnification
@@ -108,6 +109,7 @@ class StreamFrame:
     magnification: float | None
     mixed: bool = False
     interval_s: float | None = None
+    databar_rows: int = 0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -158,7 +160,7 @@ class FrameInput:
         Returns the configuration with which magnifications are read; by default ``config``.
     topic, databar_rows
         Topic of the images if they are derived from the microscope's, and the number of text rows at their bottom;
-        by default those of the configuration.
+        by default those of the configuration, which may be to find them in the first two images.
     group
         Callback group of both subscriptions.
     """
@@ -181,7 +183,7 @@ class FrameInput:
         self._reporter = reporter
         self._on_frame = on_frame
         self._magnification_config = magnification_config or (lambda: config)
-        self._databar_rows = source.databar_rows if databar_rows is None else databar_rows
+        self._databar = DatabarCutter(source.databar_rows if databar_rows is None else databar_rows)
         # Before the images, so that a late-joining node knows the magnification of its first frame.
         self._magnification = MagnificationInput(config, endpoints, reporter, group=group)
         # Images that another node of the suite derives from the microscope's are not compressed.
@@ -202,8 +204,9 @@ class FrameInput:
             scan = config.scan
             self._lines = LinePhaseCorrector(scan is not None and scan.bidirectional)
         self._undeclared = ""
-        self._barred = ""
-        self._looked_at: tuple[int, ...] = ()
+        self._said_rows = 0
+        # What another node has cut off it does not tell.
+        self._rows_before = 0 if topic is None else source.databar_rows or 0
         self._skips_late = self._images.depth <= image_input().depth
         self._transport = ""
         self._image_bytes = 0
@@ -256,7 +259,7 @@ class FrameInput:
         interval_s = self._interval_s(published_ns(info), missed)
         try:
             frame = self._frame(message, info, interval_s)
-            if not (frame.mixed and self._parameters[_MIXED.name] == "drop"):
+            if frame and not (frame.mixed and self._parameters[_MIXED.name] == "drop"):
                 self._on_frame(frame)
         except NODE_ERRORS as error:
             self._reporter.reject(error)
@@ -269,9 +272,15 @@ class FrameInput:
         self._last_interval_s = (sent_ns - before) * 1e-9 / (missed + 1)
         return self._last_interval_s
 
-    def _frame(self, message: Any, info: MessageInfo, interval_s: float | None) -> StreamFrame:
+    def _frame(
+        self, message: Any, info: MessageInfo, interval_s: float | None
+    ) -> StreamFrame | None:
+        """Return the frame of a message, None for the first one of a stream with a data bar: the next decides."""
         pixels, encoding = decoded_image(message)
-        image = without_databar(pixels, self._databar_rows)
+        self._look_for_light(pixels)
+        image = self._without_databar(pixels)
+        if image is None:
+            return None
         stamp_ns = stamp_ns_from_msg(message)
         sent_ns = self._source.published_ns(stamp_ns, info)
         g = self._magnification.at(stamp_ns, sent_ns, image.shape[1], self._magnification_config())
@@ -279,24 +288,23 @@ class FrameInput:
         self._mixed += mixed
         self._reporter.note("magnification", "unknown" if g is None else g)
         self._reporter.note("frames_mixed", self._mixed)
-        self._look_for_light(image)
-        self._look_for_databar(image)
         image = self._without_line_phase(image)
-        return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s)
+        rows = self._rows_before + self._databar.rows
+        return StreamFrame(image, encoding, message.header, stamp_ns, g, mixed, interval_s, rows)
 
-    def _look_for_databar(self, image: AnyImage) -> None:
-        """Warn of a data bar that the configuration does not tell of, at the first image of a size."""
-        if self._lines is None or self._databar_rows or image.shape == self._looked_at:
-            return
-        if is_blank_above(image):
-            return
-        self._looked_at = image.shape
-        rows = find_databar(image)
-        self._barred = (
-            f"the lowest {rows} rows look like a data bar: set image.databar_rows" if rows else ""
-        )
-        if self._barred:
-            self._reporter.warn(self._barred)
+    def _without_databar(self, pixels: AnyImage) -> AnyImage | None:
+        """Cut the data bar off; say it where the configuration does not."""
+        image = self._databar.cut(pixels)
+        rows = self._databar.rows if self._databar.has_found else 0
+        if rows != self._said_rows:
+            self._said_rows = rows
+            if rows:
+                self._reporter.warn(
+                    f"the lowest {rows} rows are a data bar and are cut off; image.databar_rows: {rows} in the"
+                    " configuration says so, 0 keeps them"
+                )
+        self._reporter.note("databar_rows", self._databar.rows)
+        return image
 
     def _without_line_phase(self, image: AnyImage) -> AnyImage:
         """Move the lines of a bidirectional scan to where they belong; warn of one that nobody declared."""
@@ -348,10 +356,8 @@ class FrameInput:
         return bool(self._images.rivals or self._magnification.rivals)
 
     def conditions(self) -> list[str]:
-        """Return, in a few words, what is odd about the images: their size, no light, a data bar, shifted lines."""
-        return [
-            text for text in (self._transport, self._dark, self._barred, self._undeclared) if text
-        ]
+        """Return, in a few words, what is odd about the images: their size, no light, shifted lines."""
+        return [text for text in (self._transport, self._dark, self._undeclared) if text]
 
 
 class StreamNode(SemNode):

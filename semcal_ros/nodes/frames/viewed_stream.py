@@ -32,8 +32,8 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.images import without_databar
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import stream_output
@@ -128,7 +128,7 @@ class ViewedImages:
     """
 
     def __init__(self, config: MicroscopeConfig, endpoints: Endpoints, group: PolledGroup) -> None:
-        self._databar_rows = config.image.databar_rows
+        self._databar = DatabarCutter(config.image.databar_rows)
         self._raw_type = message_class(config.image.type)
         self._raw = self._subscribe(
             endpoints, self._raw_type, config.image.topic, stream_output(_RAW_DEPTH), group
@@ -200,7 +200,8 @@ class ViewedImages:
         pictures = {}
         if raw is not None:
             image = self._unpack(raw, self._raw_type)
-            pictures["raw"] = without_databar(image, self._databar_rows)
+            cut = self._databar.cut(image)
+            pictures["raw"] = image if cut is None else cut
         if corrected is not None:
             pictures["corrected"] = self._unpack(corrected, Image)
         first = raw or corrected

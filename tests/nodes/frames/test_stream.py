@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.config.config import load_config
+from semcal_ros.config.config import ImageConfig, load_config
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.line_phase import estimate_line_phase
@@ -67,14 +67,20 @@ def test_late_is_more_than_40_ms_and_more_than_one_and_a_half_intervals(
 class Bench:
     """A frame input, and the frames that it hands on."""
 
-    def __init__(self, depth: float = 10, *, bidirectional: bool = False) -> None:
+    def __init__(
+        self, depth: float = 10, *, bidirectional: bool = False, databar_rows: int | None = None
+    ) -> None:
         self.endpoints: Any = FakeEndpoints(depth)
         parameters: Any = FakeParameters({"mixed_frames": "drop"})
         self.reporter, self.log = fake_reporter()
         self.frames: list[StreamFrame] = []
         config = load_config("virtual_sem")
         self.input = FrameInput(
-            replace(config, scan=ScanTiming(0.1, bidirectional=bidirectional)),
+            replace(
+                config,
+                scan=ScanTiming(0.1, bidirectional=bidirectional),
+                image=ImageConfig(databar_rows=databar_rows),
+            ),
             parameters,
             self.endpoints,
             self.reporter,
@@ -265,8 +271,23 @@ def test_a_line_phase_that_nobody_declared_is_said_once_and_left() -> None:
     assert [text for text in bench.log if "odd lines" in text] == bench.input.conditions()
 
 
-def test_a_data_bar_that_the_configuration_does_not_tell_of_is_said() -> None:
+def test_a_data_bar_that_the_configuration_does_not_tell_of_is_cut_off_and_said_once() -> None:
     bench = Bench()
-    bench.receive(1.0, 1.1, image=with_bar(scanned(), 40, "5.0 kV 10 um"))
-    assert bench.input.conditions() == [text for text in bench.log if "data bar" in text]
-    assert "lowest 40 rows" in bench.log[0]
+    bench.receive(1.0, 1.1, 1.2, image=with_bar(scanned(), 40, "5.0 kV 10 um"))
+    # The second image decides; none with another size goes out before.
+    assert bench.stamps_s == [1.1, 1.2]
+    assert {frame.image.shape for frame in bench.frames} == {scanned().shape}
+    assert {frame.databar_rows for frame in bench.frames} == {40}
+    assert [text for text in bench.log if "data bar" in text] == [
+        "the lowest 40 rows are a data bar and are cut off; image.databar_rows: 40 in the configuration says so, "
+        "0 keeps them"
+    ]
+    assert notes(bench.reporter)["databar_rows"] == "40"
+    assert bench.input.conditions() == []
+
+
+def test_a_stated_data_bar_of_no_rows_stays() -> None:
+    bench = Bench(databar_rows=0)
+    image = with_bar(scanned(), 40, "5.0 kV 10 um")
+    bench.receive(1.0, image=image)
+    assert np.array_equal(bench.frames[0].image, image) and not bench.log
