@@ -167,6 +167,11 @@ class GridView:
         """In how many directions each point is known: 1 for lines, 2 else."""
         return 2 if self.across is None else 1
 
+    @property
+    def expected_rms_px(self) -> float:
+        """RMS error, as a length in the image, that the 1-sigma of the corners predicts."""
+        return float(np.sqrt(self.dimensions * np.mean(self.sigma_px**2)))
+
     def known_residuals(self, residuals_px: Array) -> Array:
         """Return (n, dimensions) residuals along the directions that are known, of (n, 2)."""
         if self.across is None:

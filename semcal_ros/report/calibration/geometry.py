@@ -69,15 +69,16 @@ def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, flo
         x, y, z = turned.T
         o = np.zeros_like(x)
         turns = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
-        columns = np.concatenate([jacobian @ turns, jacobian], axis=2).reshape(-1, 6)
-        error = (view.image_xy - camera.project_ideal(points)).ravel()
+        columns = np.concatenate([jacobian @ turns, jacobian], axis=2)
+        error = view.known_residuals(view.image_xy - camera.project_ideal(points))
+        columns = np.stack([view.known_residuals(columns[..., k]) for k in range(6)], axis=2)
+        columns, error = columns.reshape(-1, 6), error.ravel()
         known = np.isfinite(error) & np.all(np.isfinite(columns), axis=1)
         normal = columns[known].T @ columns[known] + pull.T @ pull
         scaled, scale = equilibrate(normal)
         right = scale * (columns[known].T @ error[known])
         step = scale * np.linalg.lstsq(scaled, right, rcond=None)[0]
         squares.setdefault(float(view.magnification), []).append(
-            (error[known] - columns[known] @ step) ** 2
+            view.dimensions * (error[known] - columns[known] @ step) ** 2
         )
-    # Two components per corner.
-    return {g: float(np.sqrt(2.0 * np.mean(np.concatenate(s)))) for g, s in sorted(squares.items())}
+    return {g: float(np.sqrt(np.mean(np.concatenate(s)))) for g, s in sorted(squares.items())}

@@ -122,8 +122,8 @@ def _predict_rms(result: CalibrationResult, g: Array) -> Array:
     """Predict the (G,) RMS error from the 1-sigma of the corners alone, px."""
     variances: dict[float, list[Array]] = {float(x): [] for x in g}
     for view in result.views:
-        variances[float(view.magnification)].append(view.sigma_px**2)
-    return np.array([np.sqrt(2.0 * np.mean(np.concatenate(v))) for v in variances.values()])
+        variances[float(view.magnification)].append(view.dimensions * view.sigma_px**2)
+    return np.array([np.sqrt(np.mean(np.concatenate(v))) for v in variances.values()])
 
 
 def _plot_held_out(axes: Axes, g: Array, held: Array) -> None:

@@ -119,7 +119,7 @@ def choose_worst_views(
     """
     ratios = np.array(
         [
-            _compute_rms_px(residuals) / np.sqrt(2.0 * np.mean(view.sigma_px**2))
+            _compute_rms_px(residuals) / view.expected_rms_px
             for view, residuals in zip(result.views, result.fit.residuals_px, strict=True)
         ]
     )
@@ -166,9 +166,8 @@ def _describe(
         reasons.append(
             f"it has {counted(len(residuals), 'corner')}, other views at this magnification {np.median(same):.0f}"
         )
-    sigma_px = float(np.sqrt(2.0 * np.mean(view.sigma_px**2)))
     facts = (
-        ("RMS", f"{rms}: {ratio:.2f} times the noise of its corners ({format_px(sigma_px)})"),
+        ("RMS", f"{rms}: {ratio:.2f} times the noise of its corners ({format_px(view.expected_rms_px)})"),
         (
             "Largest residual",
             f"{format_px(float(lengths[worst]))}, {format_length(float(lengths[worst]) * pixel_m)}, "

@@ -290,10 +290,12 @@ def field_system(
     group = problem.group if scaled.effects is None else scaled.effects.visit_group
     z = np.concatenate([problem.designs @ result.state.theta, slices], axis=1)[group]
     right += np.einsum("vpq,vq->vp", information, z)
-    excess = np.add.reduceat(
+    # Of each residual half the square, of which a corner has two.
+    half = 0.5 * problem.dimensions
+    excess = half * np.add.reduceat(
         result.huber_weight * (1.0 - own_variance / variance), problem.starts[:-1]
     )
-    observations = 2.0 * np.diff(problem.starts)
+    observations = problem.dimensions * np.diff(problem.starts).astype(float)
     if not few:
         count = len(setup.magnifications)
         observations = sum_by(problem.group, count, observations)

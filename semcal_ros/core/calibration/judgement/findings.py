@@ -288,7 +288,7 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
     bad = []
     for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        ratio = rms / float(np.sqrt(view.dimensions * np.mean(view.sigma_px**2)))
+        ratio = rms / view.expected_rms_px
         if ratio > _VIEW_RATIO:
             bad.append((ratio, rms, view))
     if bad:
