@@ -23,7 +23,7 @@ per period.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ _LEAST_PERIODS, _LEAST_PERIOD_PX = 3.5, 5.0
 # Power of the lines over the median at frequencies of the same size. The power of noise has an exponential
 # distribution: the largest of half a million values is 19 times the median, and 200 times has a chance of 1e-55.
 _PEAK = 200.0
-# Power at a half or a third of the frequency that makes it the frequency: over the same median, which chance exceeds
+# Power at a part of the frequency that makes it the frequency: over the same median, which chance exceeds
 # once in 1e15, and over that of the frequency, whose side lobes behind the window are below.
 _SUBMULTIPLE, _SIDE_LOBE = 50.0, 1e-3
 # Power at any frequency that is no multiple, relative to that of the lines, from which the pattern repeats across them
@@ -54,6 +54,19 @@ _ACROSS = 0.1
 _LOBE, _BENT = 3.0, 0.1
 # Frequencies of the same size, in octaves either way: at the least number of periods, some 70 are no multiples.
 _RING = 1.0
+# Of narrow lines many harmonics are as strong as the fundamental, and a hole has the less power the higher they are.
+_HIGHEST_HARMONIC = 9
+# Median amplitude of a frequency over that of others of its size, from which it is everywhere, and their directions;
+# and the low pass as a part of the picture: a hole of a third of the side then reaches a quarter of the places. The
+# median over some twenty independent places scatters by a sixth where there is noise alone.
+_EVERYWHERE, _PLACES = 2.5, 16
+_OTHER_DIRECTIONS_DEG = (45.0, 90.0, 135.0)
+# Part of the pixels whose grey levels are clipped at either end: holes and debris in a fifth of the picture then have
+# no more contrast than lines that take more than that of their period.
+_CLIPPED = 0.2
+# What power is usual: the quantile in rings of this width in octaves. At the least number of periods a lobe of the
+# window takes half of a ring.
+_USUAL, _RING_OCTAVES = 0.25, 0.25
 # Standard deviation of the low pass behind the demodulation, in periods: harmonics are down to 4e-5.
 _SMOOTH = 0.75
 # Degree of the smooth part of the phase. The rest is added to it.
@@ -75,17 +88,20 @@ class _Wave:
     frequency
         (2,) cycles per pixel along x and y.
     power
-        Its power over the median at frequencies of the same size.
+        Power of the clearest one of its multiples over the median of others.
     across
         The largest power at other frequencies than its multiples, over its own.
     octave
         The scale at which it was found.
+    is_clipped
+        Whether it was found in the image with clipped grey levels.
     """
 
     frequency: Array
     power: float
     across: float
     octave: int
+    is_clipped: bool = False
 
     @property
     def period_px(self) -> float:
@@ -111,7 +127,7 @@ def find_lines(
     there is none: no frequency stands out, or lines or points repeat in another direction too.
     """
     octaves = range(max(0, int(np.ceil(np.log2(max(size) / _PART_PX)))) + 1)
-    waves = [_find_wave(level(octave), octave) for octave in octaves]
+    waves = [_find_clearest_wave(level(octave), octave) for octave in octaves]
     found = [wave for wave in waves if wave is not None and wave.power > _PEAK]
     if not found:
         return Rejection(
@@ -126,7 +142,8 @@ def find_lines(
         )
     # The coarsest scale that resolves them is as good as any for the phase, and costs least.
     octave = max(0, int(np.log2(wave.period_px / (1.6 * _LEAST_PERIOD_PX))))
-    lattice = _follow(level(octave), wave.frequency * 2.0 ** (octave - wave.octave))
+    image = _clip(level(octave)) if wave.is_clipped else level(octave)
+    lattice = _follow(image, wave.frequency * 2.0 ** (octave - wave.octave))
     if isinstance(lattice, Rejection):
         return lattice
     factor = 2.0**octave
@@ -175,8 +192,79 @@ def fit_lines(ij: Indices, xy: Array) -> LineFit:
     return LineFit(along, float(np.sqrt(np.mean(across**2))))
 
 
-def _find_wave(image: Image, octave: int) -> _Wave | None:
-    """Find the strongest frequency in the middle of an image; None where it has no contrast."""
+def _clip(image: Array32) -> Array32:
+    """Clip the grey levels of an image, so that a hole or debris is no more than what lies beside the lines."""
+    low, high = np.quantile(image[::4, ::4], [_CLIPPED, 1.0 - _CLIPPED])
+    return np.clip(image, low, high)
+
+
+def _find_clearest_wave(image: Array32, octave: int) -> _Wave | None:
+    """Find the strongest frequency, with or without clipped grey levels, whichever has it stand out more."""
+    wave, clipped = _find_wave(image, octave), _find_wave(_clip(image), octave)
+    if clipped is None or (wave is not None and wave.power >= clipped.power):
+        return wave
+    return replace(clipped, is_clipped=True)
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """The middle of an image behind a window, and its power spectrum.
+
+    Attributes
+    ----------
+    part
+        (h, w) the windowed pixels.
+    power
+        (h, w // 2 + 1) power.
+    clearness
+        Power over what is usual for frequencies of the same size.
+    fx, fy
+        Frequencies, cycles per pixel.
+    """
+
+    part: Array
+    power: Array
+    clearness: Array
+    fx: Array
+    fy: Array
+
+    def bins_from(self, frequency: Array) -> Array:
+        """Return the distance of all frequencies from one, in bins."""
+        height, width = self.part.shape
+        off = np.hypot((self.fx - frequency[0]) * width, (self.fy - frequency[1]) * height)
+        return np.asarray(off)
+
+    def is_aside(self, frequency: Array) -> Mask:
+        """Return which frequencies are no multiples of one, within the window's lobes and the bend of the lines."""
+        along = (self.fx * frequency[0] + self.fy * frequency[1]) / float(frequency @ frequency)
+        height, width = self.part.shape
+        aside = np.hypot(
+            (self.fx - along * frequency[0]) * width, (self.fy - along * frequency[1]) * height
+        )
+        return np.asarray(aside > _LOBE + _BENT * self.bins_from(np.zeros(2)))
+
+    def centre_near(self, frequency: Array) -> Array:
+        """Return the centre of the power near a frequency."""
+        own = np.where(self.bins_from(frequency) < _LOBE, self.power, 0.0)
+        return np.array([(own * self.fx).sum(), (own * self.fy).sum()]) / float(own.sum())
+
+    def is_part(self, frequency: Array, highest: float) -> bool:
+        """Whether one of the lines' frequencies has this one as its fundamental.
+
+        The power has a maximum there, while that of a hole rises towards lower frequencies, and it comes from
+        everywhere in the picture and not from the edge of a hole.
+        """
+        off = self.bins_from(frequency)
+        near = np.unravel_index(np.argmax(np.where(off < _LOBE, self.clearness, 0.0)), off.shape)
+        return bool(
+            off[near] < 0.5 * _LOBE
+            and self.clearness[near] > _SUBMULTIPLE
+            and self.power[near] > _SIDE_LOBE * highest
+            and _is_everywhere(self.part, self.centre_near(frequency))
+        )
+
+
+def _compute_spectrum(image: Image) -> _Spectrum:
     height, width = (min(side, _PART_PX) for side in image.shape)
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
     part = image[top : top + height, left : left + width].astype(np.float64)
@@ -184,53 +272,76 @@ def _find_wave(image: Image, octave: int) -> _Wave | None:
     part = (part - float((part * window).sum() / window.sum())) * window
     power = np.abs(np.fft.rfft2(part)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
-    radius = np.hypot(fx, fy)
-    lowest = _LEAST_PERIODS / min(height, width)
+    return _Spectrum(part, power, power / _usual_power(power, np.hypot(fx, fy)), fx, fy)
+
+
+def _find_wave(image: Image, octave: int) -> _Wave | None:
+    """Find the strongest frequency in the middle of an image; None where it has no contrast."""
+    spectrum = _compute_spectrum(image)
+    radius = np.hypot(spectrum.fx, spectrum.fy)
+    lowest = _LEAST_PERIODS / min(spectrum.part.shape)
     allowed = (radius > lowest) & (radius < 1.0 / _LEAST_PERIOD_PX)
-    if not np.any(allowed) or float(power[allowed].max()) <= 0.0:
+    if not np.any(allowed) or float(spectrum.power[allowed].max()) <= 0.0:
         return None
-    row, column = np.unravel_index(np.argmax(np.where(allowed, power, 0.0)), power.shape)
-    frequency = np.array([fx[row, column], fy[row, column]])
+    # A hole or debris has more power at low frequencies than the lines, but in all directions.
+    best = np.unravel_index(np.argmax(np.where(allowed, spectrum.clearness, 0.0)), radius.shape)
+    frequency = np.array([spectrum.fx[best], spectrum.fy[best]])
+    highest, clearest = float(spectrum.power[best]), float(spectrum.clearness[best])
+    parts = (frequency / divisor for divisor in range(_HIGHEST_HARMONIC, 1, -1))
+    fundamental = next(
+        (f for f in parts if np.linalg.norm(f) >= lowest and spectrum.is_part(f, highest)),
+        frequency,
+    )
+    frequency = spectrum.centre_near(fundamental)
+    aside = spectrum.is_aside(frequency)
+    octaves = np.abs(np.log2(np.maximum(radius, 1e-9) / float(np.linalg.norm(frequency))))
+    others = spectrum.clearness[(octaves < _RING) & aside]
+    relative = np.minimum(spectrum.power / highest, spectrum.clearness / clearest)
+    return _Wave(
+        frequency,
+        clearest / float(np.median(others)) if len(others) else 0.0,
+        float(np.max(relative[(radius > lowest) & aside], initial=0.0)),
+        octave,
+    )
 
-    bins = np.hypot(fx * width, fy * height)
 
-    def is_aside(f: Array) -> Mask:
-        """Whether frequencies are no multiples of one, within the lobes of the window and the bend of the lines."""
-        along = (fx * f[0] + fy * f[1]) / float(f @ f)
-        aside = np.hypot((fx - along * f[0]) * width, (fy - along * f[1]) * height)
-        return np.asarray(aside > _LOBE + _BENT * bins)
+def _is_everywhere(part: Array, frequency: Array) -> bool:
+    """Whether most of a windowed image has this frequency, more than others of its size."""
+    period = float(1.0 / np.linalg.norm(frequency))
+    step = max(1, int(period / (1.6 * _LEAST_PERIOD_PX)))
+    height, width = (side // step for side in part.shape)
+    small = np.asarray(
+        cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
+    )
+    turns = np.radians([0.0, *_OTHER_DIRECTIONS_DEG])
+    c, s = np.cos(turns), np.sin(turns)
+    x, y = step * frequency
+    directions = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    # The window takes the outer parts down.
+    inner = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    sigma = max(_SMOOTH * period / step, min(min(small.shape) / _PLACES, 3.0 * period / step))
+    own, *others = (float(np.median(_demodulate(small, f, sigma)[0][inner])) for f in directions)
+    return own > _EVERYWHERE * max(others)
 
-    def median_near(f: Array) -> float:
-        octaves = np.abs(np.log2(np.maximum(radius, 1e-9) / float(np.linalg.norm(f))))
-        others = power[(octaves < _RING) & is_aside(f)]
-        return max(float(np.median(others)), 1e-300) if len(others) else np.inf
 
-    def strongest_near(f: Array) -> tuple[float, Array]:
-        near = np.hypot((fx - f[0]) * width, (fy - f[1]) * height) < _LOBE
-        own = np.where(near, power, 0.0)
-        total = float(own.sum())
-        return float(own.max()), np.array([(own * fx).sum(), (own * fy).sum()]) / max(total, 1e-300)
+def _usual_power(power: Array, radius: Array) -> Array:
+    """Return a low quantile of the power at frequencies of each size, interpolated between rings."""
+    at = np.log2(np.maximum(radius, radius[radius > 0.0].min())) / _RING_OCTAVES
+    ring = np.rint(at).astype(int)
+    rings = np.unique(ring)
 
-    highest = float(power[row, column])
-    for divisor in (3.0, 2.0):
-        lower = frequency / divisor
-        if np.linalg.norm(lower) < lowest:
-            continue
-        peak, centre = strongest_near(lower)
-        if peak > max(_SUBMULTIPLE * median_near(lower), _SIDE_LOBE * highest):
-            frequency = centre
-            break
-    peak, frequency = strongest_near(frequency)
-    others = (radius > lowest) & is_aside(frequency)
-    across = float(np.max(power[others], initial=0.0)) / highest
-    return _Wave(frequency, peak / median_near(frequency), across, octave)
+    def low(values: Array) -> float:
+        return float(np.quantile(values, _USUAL))
+
+    usual = ndimage.labeled_comprehension(power, ring, rings, low, float, 0.0)
+    return np.asarray(np.exp(np.interp(at, rings, np.log(np.maximum(usual, 1e-300)))))
 
 
 def _follow(image: Array32, frequency: Array) -> Lattice | Rejection[LatticeStatus]:
     """Return places on the lines of this frequency, by the phase of the image."""
     height, width = image.shape
     period = float(1.0 / np.linalg.norm(frequency))
-    amplitude, phase_rate, values = _demodulate(image, frequency, period)
+    amplitude, phase_rate, values = _demodulate(image, frequency, _SMOOTH * period)
     smooth = _fit_phase(amplitude, values, period)
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
     weight = amplitude**2
@@ -268,11 +379,10 @@ def _follow(image: Array32, frequency: Array) -> Lattice | Rejection[LatticeStat
     return Lattice(ij[kept], xy[kept], axes)
 
 
-def _demodulate(image: Array32, frequency: Array, period: float) -> tuple[Array, Array, Array]:
+def _demodulate(image: Array32, frequency: Array, sigma: float) -> tuple[Array, Array, Array]:
     """Return the (h, w) amplitude, the (2,) phase per pixel that was taken off, and the (h, w) rest as unit phasors."""
     height, width = image.shape
     rate = 2.0 * np.pi * frequency
-    sigma = _SMOOTH * period
     level = cv2.GaussianBlur(image, (0, 0), sigma)
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
     wave = np.exp(-1j * (rate[0] * columns + rate[1] * rows))

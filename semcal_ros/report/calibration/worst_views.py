@@ -167,7 +167,10 @@ def _describe(
             f"it has {counted(len(residuals), 'corner')}, other views at this magnification {np.median(same):.0f}"
         )
     facts = (
-        ("RMS", f"{rms}: {ratio:.2f} times the noise of its corners ({format_px(view.expected_rms_px)})"),
+        (
+            "RMS",
+            f"{rms}: {ratio:.2f} times the noise of its corners ({format_px(view.expected_rms_px)})",
+        ),
         (
             "Largest residual",
             f"{format_px(float(lengths[worst]))}, {format_length(float(lengths[worst]) * pixel_m)}, "

@@ -75,6 +75,50 @@ def test_a_double_period_is_seen_where_every_other_line_is_fainter() -> None:
     assert abs(found.spacing_px - 24.0) < 0.1
 
 
+def phase_of_lines(
+    side: int, period: float, turn: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance from the middle of the next line in periods, and the pixels' x and y."""
+    y, x = np.mgrid[0:side, 0:side].astype(float)
+    at = (x * np.cos(turn) + y * np.sin(turn)) / period
+    return np.abs(at - np.rint(at)), x, y
+
+
+def photographed(rng: np.random.Generator, mean: np.ndarray) -> np.ndarray:
+    noisy = rng.normal(cv2.GaussianBlur(mean, (0, 0), 1.0), 8.0)
+    return np.asarray(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_hole_or_a_deposit_with_more_contrast_than_the_lines_hides_no_others(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    side, period = 400, float(rng.uniform(12.0, 50.0))
+    off, x, y = phase_of_lines(side, period, rng.uniform(0.0, np.pi))
+    mean = np.where(off < rng.uniform(0.15, 0.35), 130.0, 70.0)
+    cx, cy = rng.uniform(0.3, 0.7, 2) * side
+    radius = rng.uniform(0.1, 0.16) * side
+    square = np.maximum(np.abs(x - cx), 1.4 * np.abs(y - cy))
+    mean[(square if seed % 2 else np.hypot(x - cx, y - cy)) < radius] = rng.choice([10.0, 245.0])
+    found = find_lattice(photographed(rng, mean), pattern="grating")
+    assert isinstance(found, LatticeDetection), found.reason
+    # Lines that the hole covers are missing, and a period of 50 px has eight lines.
+    assert found.spacing_px == pytest.approx(period, rel=0.01)
+
+
+@pytest.mark.parametrize("period", [16.0, 30.0, 64.0])
+@pytest.mark.parametrize("turn", [0.3, 1.1, 2.2])
+def test_bright_edges_at_even_distances_are_not_taken_for_lines(period: float, turn: float) -> None:
+    # Faces and gaps are of one width, and what tells them is a twentieth of the contrast of the edges.
+    off, x, _ = phase_of_lines(384, period, turn)
+    edges = np.exp(-0.5 * ((off - 0.25) / 0.05) ** 2)
+    rng = np.random.default_rng(0)
+    found = find_lattice(
+        photographed(rng, 60.0 + 0.05 * x + 8.0 * (off < 0.25) + 160.0 * edges), pattern="grating"
+    )
+    assert isinstance(found, LatticeDetection), found.reason
+    assert found.spacing_px == pytest.approx(period, rel=0.01)
+
+
 @pytest.mark.parametrize(
     "board",
     [
