@@ -54,6 +54,14 @@ _ACROSS = 0.1
 _LOBE, _BENT = 3.0, 0.1
 # Frequencies of the same size, in octaves either way: at the least number of periods, some 70 are no multiples.
 _RING = 1.0
+# Frequencies of the lines are compared up to this multiple of the clearest one. They are known to so many bins, and
+# where lines are bent to that part of them.
+_COMPARED, _OFF, _UNSURE = 2.2, 1.0, 0.02
+_MOST_PEAKS = 12
+# Clearness over that of the clearest, from which a maximum counts: those of a hole's edge are mostly below.
+_FAINT_PEAK = 5e-3
+# Power of a multiple over that of the frequency itself from which the lines are followed by the multiple.
+_FAR_LARGER = 10.0
 # Of narrow lines many harmonics are as strong as the fundamental, and a hole has the less power the higher they are.
 _HIGHEST_HARMONIC = 9
 # Median amplitude of a frequency over that of others of its size, from which it is everywhere, and their directions;
@@ -93,6 +101,9 @@ class _Wave:
         The largest power at other frequencies than its multiples, over its own.
     octave
         The scale at which it was found.
+    multiple
+        Which of its multiples has most of the power: lines whose edges are bright may have hardly any at the frequency
+        itself.
     is_clipped
         Whether it was found in the image with clipped grey levels.
     """
@@ -101,6 +112,7 @@ class _Wave:
     power: float
     across: float
     octave: int
+    multiple: int
     is_clipped: bool = False
 
     @property
@@ -138,16 +150,22 @@ def find_lines(
     if wave.across > _ACROSS:
         return Rejection(
             LatticeStatus.OTHER_PATTERN,
-            "no grating: what is seen repeats in two directions: set the pattern to auto",
+            "no grating: frequencies in another direction are as strong, as of a pattern that repeats in two: set the"
+            " pattern to auto",
         )
     # The coarsest scale that resolves them is as good as any for the phase, and costs least.
-    octave = max(0, int(np.log2(wave.period_px / (1.6 * _LEAST_PERIOD_PX))))
+    octave = max(0, int(np.log2(wave.period_px / wave.multiple / (1.6 * _LEAST_PERIOD_PX))))
     image = _clip(level(octave)) if wave.is_clipped else level(octave)
-    lattice = _follow(image, wave.frequency * 2.0 ** (octave - wave.octave))
+    lattice = _follow(image, wave.multiple * wave.frequency * 2.0 ** (octave - wave.octave))
     if isinstance(lattice, Rejection):
         return lattice
+    own = np.all(lattice.ij % wave.multiple == 0, axis=1)
     factor = 2.0**octave
-    return Lattice(lattice.ij, enlarged(lattice.xy, factor), lattice.axes * factor)
+    return Lattice(
+        lattice.ij[own] // wave.multiple,
+        enlarged(lattice.xy[own], factor),
+        lattice.axes[own] * (factor * wave.multiple),
+    )
 
 
 @dataclass(frozen=True)
@@ -248,20 +266,66 @@ class _Spectrum:
         own = np.where(self.bins_from(frequency) < _LOBE, self.power, 0.0)
         return np.array([(own * self.fx).sum(), (own * self.fy).sum()]) / float(own.sum())
 
-    def is_part(self, frequency: Array, highest: float) -> bool:
-        """Whether one of the lines' frequencies has this one as its fundamental.
+    def find_divisor(self, frequency: Array, lowest: float, highest: float) -> int:
+        """Return by what a frequency of the lines is to be divided, so that all of them are its multiples."""
+        height, width = self.part.shape
+        bins = float(np.hypot(frequency[0] * width, frequency[1] * height))
+        ratios = self.find_ratios(frequency, lowest, highest)
+        tolerance = _OFF + _UNSURE * ratios * bins
+        most = max(1, min(_HIGHEST_HARMONIC, int(np.linalg.norm(frequency) / lowest)))
+        for divisor in range(1, most + 1):
+            off = np.abs(ratios - np.rint(ratios * divisor) / divisor) * bins
+            if np.all(off < tolerance):
+                return divisor
+        return 1
+
+    def find_faint_divisor(self, frequency: Array, lowest: float, highest: float) -> int:
+        """Return by what a frequency is to be divided since the lines have that, too, however faintly.
+
+        Every other line may differ from those beside it by a little.
+        """
+        for divisor in range(_HIGHEST_HARMONIC, 1, -1):
+            unit = frequency / divisor
+            if np.linalg.norm(unit) < lowest:
+                continue
+            off = self.bins_from(unit)
+            at = np.unravel_index(np.argmax(np.where(off < _LOBE, self.clearness, 0.0)), off.shape)
+            clear = self.clearness[at] > _SUBMULTIPLE and self.power[at] > _SIDE_LOBE * highest
+            if off[at] < 0.5 * _LOBE and clear and _is_everywhere(self.part, unit):
+                return divisor
+        return 1
+
+    def find_ratios(self, frequency: Array, lowest: float, highest: float) -> Array:
+        """Return the other frequencies of the lines over one of them.
 
         The power has a maximum there, while that of a hole rises towards lower frequencies, and it comes from
         everywhere in the picture and not from the edge of a hole.
         """
-        off = self.bins_from(frequency)
-        near = np.unravel_index(np.argmax(np.where(off < _LOBE, self.clearness, 0.0)), off.shape)
-        return bool(
-            off[near] < 0.5 * _LOBE
-            and self.clearness[near] > _SUBMULTIPLE
-            and self.power[near] > _SIDE_LOBE * highest
-            and _is_everywhere(self.part, self.centre_near(frequency))
-        )
+        own = float(np.linalg.norm(frequency))
+        ratio = np.abs(self.fx * frequency[0] + self.fy * frequency[1]) / own**2
+        side = 4 * int(_LOBE) + 1
+        peaks = self.clearness == ndimage.maximum_filter(self.clearness, side, mode="wrap")
+        clearest = float(self.clearness[peaks & (ratio < _COMPARED)].max())
+        peaks &= self.clearness > max(_SUBMULTIPLE, _FAINT_PEAK * clearest)
+        peaks &= self.power > _SIDE_LOBE * highest
+        peaks &= ~self.is_aside(frequency) & (ratio > lowest / own) & (ratio < _COMPARED)
+        rows, columns = np.nonzero(peaks)
+        order = np.argsort(-self.clearness[rows, columns], kind="stable")[:_MOST_PEAKS]
+        centres = [
+            self.centre_near(np.array([self.fx[at], self.fy[at]]))
+            for at in zip(rows[order], columns[order], strict=True)
+        ]
+        everywhere = [f for f in centres if _is_everywhere(self.part, f)]
+        return np.abs(np.array(everywhere).reshape(-1, 2) @ frequency) / own**2
+
+    def strongest_multiple(self, frequency: Array, most: int) -> int:
+        """Return by what the frequency is multiplied where its power is largest; 1 unless another is far larger."""
+        power = [
+            float(self.power[self.bins_from(m * frequency) < _LOBE].max())
+            for m in range(1, most + 1)
+        ]
+        best = int(np.argmax(power))
+        return best + 1 if power[best] > _FAR_LARGER * power[0] else 1
 
 
 def _compute_spectrum(image: Image) -> _Spectrum:
@@ -287,12 +351,10 @@ def _find_wave(image: Image, octave: int) -> _Wave | None:
     best = np.unravel_index(np.argmax(np.where(allowed, spectrum.clearness, 0.0)), radius.shape)
     frequency = np.array([spectrum.fx[best], spectrum.fy[best]])
     highest, clearest = float(spectrum.power[best]), float(spectrum.clearness[best])
-    parts = (frequency / divisor for divisor in range(_HIGHEST_HARMONIC, 1, -1))
-    fundamental = next(
-        (f for f in parts if np.linalg.norm(f) >= lowest and spectrum.is_part(f, highest)),
-        frequency,
-    )
-    frequency = spectrum.centre_near(fundamental)
+    frequency = spectrum.centre_near(frequency)
+    divisor = spectrum.find_divisor(frequency, lowest, highest)
+    divisor *= spectrum.find_faint_divisor(frequency / divisor, lowest, highest)
+    frequency = frequency / divisor
     aside = spectrum.is_aside(frequency)
     octaves = np.abs(np.log2(np.maximum(radius, 1e-9) / float(np.linalg.norm(frequency))))
     others = spectrum.clearness[(octaves < _RING) & aside]
@@ -302,6 +364,7 @@ def _find_wave(image: Image, octave: int) -> _Wave | None:
         clearest / float(np.median(others)) if len(others) else 0.0,
         float(np.max(relative[(radius > lowest) & aside], initial=0.0)),
         octave,
+        spectrum.strongest_multiple(frequency, divisor),
     )
 
 
