@@ -68,6 +68,9 @@ _LARGEST_SCALE_PART = 0.075
 MINIMUM_CORNERS = 8
 # Points of a lattice that is looked at closely: less would be a seed and its neighbours.
 _LEAST_GROWN = 6
+# How much more of the picture a less likely pattern has to cover than a likelier one of the same lattice to be taken
+# for it. Chosen, not measured.
+_MORE = 1.5
 # A lattice whose regular squares cover this part of the image will not be surpassed at another scale.
 _FILLED = 0.6
 # Part of the expected points that pass beyond which no coarser picture shows more of them.
@@ -219,13 +222,17 @@ def find_lattice(
     best: LatticeDetection | None = None
     is_clear = False
     for candidate in _rank(list(_search(pyramid))):
+        own: LatticeDetection | None = None
         for shape in _likely_shapes(candidate, wanted):
             found = shape if isinstance(shape, Rejection) else _measure(pyramid, candidate, shape)
             if isinstance(found, Rejection):
                 # What is said is said of the candidate that covers most of the image.
                 answer = answer or found
-            elif best is None or _filled_by(found) > _filled_by(best):
-                best, is_clear = found, candidate.is_clear
+            # What is less likely must cover clearly more.
+            elif own is None or _filled_by(found) > _MORE * _filled_by(own):
+                own = found
+        if own is not None and (best is None or _filled_by(own) > _filled_by(best)):
+            best, is_clear = own, candidate.is_clear
         if best is not None and candidate.filled > 0.5 * _FILLED:
             break
     if best is not None and is_clear:
@@ -386,8 +393,7 @@ def _likely_shapes(
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
         if candidate.is_mixture:
             likely = [s for s in shapes.every if s.pattern != "chess"]
-        # Blurred dots may as well be crosses, which are rarer.
-        likely.sort(key=lambda s: (s.pattern != "chess", s.pattern == "crosses", s.misfit))
+        likely.sort(key=shapes.rank)
         return list(likely)
     # The same points lie at the middle of dots and of crosses: only a chess board has others.
     if (shapes.best.pattern == "chess") != (wanted == "chess") and not shapes.allows(wanted):

@@ -60,21 +60,27 @@ PATTERN_NAMES = {
     "grating": "parallel lines",
 }
 
+# What is taken for likely where nothing else decides, first to last.
+_COMMONEST: tuple[Pattern, ...] = ("chess", "dots", "lines", "crosses")
 # Harmonics up to this order: with more, small spacings would be judged by noise.
 ORDERS = 4
 # Ratio of the misfits of a pattern and of the best one up to which both are possible: with 28
-# harmonics, noise alone exceeds it once in 30 images (F test). A pattern so blurred that only its
-# first harmonics are left may be any; it is taken for the chess board that this suite was made for.
+# harmonics, noise alone exceeds it once in 30 images (F test).
 AMBIGUOUS = 2.0
+# The same, up to which a chess board is presumed: odds of 20 to one with the 28 harmonics, 20^(2 / 28).
+COMPARABLE = 1.24
 # Misfit that the steps of sizes and blurs cause.
 MISFIT_LEAST = 2e-4
 # Diameters of discs and sides of squares, in cells; and blurs.
 SIZES: Array = np.linspace(0.08, 0.98, 46)
-CHESS_SIZES: Array = np.linspace(0.7, 1.0, 16)
+CHESS_SIZES: Array = np.linspace(0.82, 1.0, 10)
 BLURS: Array = np.linspace(0.0, 0.24, 13)
 # Half lengths of the arms of crosses, from their centre, and widths of the arms, in cells. Longer arms meet: lines.
 ARM_LENGTHS: Array = np.linspace(0.2, 0.44, 7)
-ARM_WIDTHS: Array = np.linspace(0.06, 0.3, 9)
+ARM_WIDTHS: Array = np.linspace(0.06, 0.42, 13)
+# Edges are brighter than faces: a rim of this width, in cells, and the part of its brightness that the face lacks.
+RIMS: Array = np.array([0.05, 0.1])
+DIMNESS: Array = np.array([0.25, 0.5, 0.75])
 # Least opening between lines, in cells. Square dots that wide could as well be what bars 0.45 of their distance wide
 # leave open.
 LINES_LEAST = 0.55
@@ -142,8 +148,8 @@ class CellShapes:
 
     @property
     def best(self) -> CellShape:
-        """The shape with the least misfit; that of a chess board as far as the blur allows it."""
-        return self.chess if self.allows("chess") else self._least
+        """The most likely shape."""
+        return min(self.every, key=self.rank)
 
     @property
     def _least(self) -> CellShape:
@@ -152,6 +158,17 @@ class CellShapes:
     def allows(self, pattern: Pattern) -> bool:
         """Whether it may be this pattern: whether no other one is much more likely."""
         return self.get(pattern).misfit <= AMBIGUOUS * self._least.misfit
+
+    def rank(self, shape: CellShape) -> tuple[int, float]:
+        """Return what sorts shapes by how likely they are; of those that are about as likely, the commoner comes first.
+
+        Any blurred pattern may be a chess board, and blurred or stubby crosses may be dots, which have the same middle.
+        A chess board has other points, by which the scale would be wrong: it is not presumed by as much.
+        """
+        ratio = COMPARABLE if shape.pattern == "chess" else AMBIGUOUS
+        if shape.misfit > ratio * self._least.misfit:
+            return len(_COMMONEST), shape.misfit
+        return _COMMONEST.index(shape.pattern), shape.misfit
 
     def odds_against(self, pattern: Pattern) -> float:
         """Return how many times as likely the best pattern is; the harmonics have independent, normal errors."""
@@ -201,6 +218,30 @@ def _harmonics() -> tuple[Array, Array]:
     return h[half], k[half]
 
 
+def _list_rims(width: float) -> list[tuple[float, float]]:
+    """Return no rim, and the rims that a face of this width can have, each with how much dimmer the face is."""
+    rims = [float(rim) for rim in RIMS if 2.0 * rim < width]
+    return [(0.0, 0.0), *((rim, float(dimness)) for rim in rims for dimness in DIMNESS)]
+
+
+def _disc(size: float, radius: Array) -> Array:
+    return np.asarray(j1(np.pi * size * radius) * size / radius)
+
+
+def _square(size: float, h: Array, k: Array) -> Array:
+    return np.asarray(size * size * np.sinc(size * h) * np.sinc(size * k))
+
+
+def _cross(arm: float, width: float, h: Array, k: Array) -> Array:
+    one = np.sinc(arm * h) * np.sinc(width * k) + np.sinc(width * h) * np.sinc(arm * k)
+    return np.asarray(arm * width * one - _square(width, h, k))
+
+
+def _tip(side: float, h: Array, k: Array) -> Array:
+    """A square that stands on its tip."""
+    return _square(side, (h + k) / np.sqrt(2.0), (h - k) / np.sqrt(2.0))
+
+
 @cache
 def _shapes() -> _Shapes:
     h, k = _harmonics()
@@ -217,19 +258,21 @@ def _shapes() -> _Shapes:
                 names.append(name)
                 rows.append((centred, size, float(blur), moved / np.linalg.norm(moved)))
 
-    for size in SIZES:
-        add("dots", float(size), j1(np.pi * size * radius) * size / radius)
+    for size in map(float, SIZES):
         # Openings wider than this leave lines between them; narrower ones are square dots.
-        square = size * size * np.sinc(size * h) * np.sinc(size * k)
-        add("lines" if size >= LINES_LEAST else "dots", float(size), square)
-    for arm in 2.0 * ARM_LENGTHS:
-        for width in ARM_WIDTHS[arm > 2.0 * ARM_WIDTHS]:
-            one = np.sinc(arm * h) * np.sinc(width * k) + np.sinc(width * h) * np.sinc(arm * k)
-            both = width * width * np.sinc(width * h) * np.sinc(width * k)
-            add("crosses", float(arm), arm * width * one - both)
-    for size in CHESS_SIZES:
-        tip = np.sinc(size * (h + k) / 2.0) * np.sinc(size * (h - k) / 2.0)
-        add("chess", float(size), tip)
+        squares: Pattern = "lines" if size >= LINES_LEAST else "dots"
+        for rim, dimness in _list_rims(size):
+            add("dots", size, _disc(size, radius) - dimness * _disc(size - 2.0 * rim, radius))
+            add(squares, size, _square(size, h, k) - dimness * _square(size - 2.0 * rim, h, k))
+    for arm in map(float, 2.0 * ARM_LENGTHS):
+        for width in map(float, ARM_WIDTHS[arm > 1.5 * ARM_WIDTHS]):
+            for rim, dimness in _list_rims(width):
+                face = _cross(arm - 2.0 * rim, width - 2.0 * rim, h, k)
+                add("crosses", arm, _cross(arm, width, h, k) - dimness * face)
+    for size in map(float, CHESS_SIZES):
+        side = size / np.sqrt(2.0)
+        for rim, dimness in _list_rims(side):
+            add("chess", size, _tip(side, h, k) - dimness * _tip(side - 2.0 * rim, h, k))
     centred, sizes, blurs, transforms = (np.array(column) for column in zip(*rows, strict=True))
     return _Shapes(tuple(names), centred, sizes, blurs, transforms)
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pytest
 
@@ -242,3 +243,30 @@ def test_dots_too_blurred_to_tell_from_squares_are_found_if_asked_for() -> None:
 def test_an_unknown_pattern_is_an_error() -> None:
     with pytest.raises(InvalidValueError, match="auto, chess, dots, crosses, lines"):
         find_lattice(np.zeros((64, 64), np.uint8), pattern="hexagons")
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("length", "width"), [(0.30, 0.14), (0.35, 0.10), (0.35, 0.14), (0.35, 0.16), (0.35, 0.18)]
+)
+@pytest.mark.parametrize("pitch", [24.0, 40.0, 64.0])
+def test_crosses_with_bright_edges_are_no_chess_board(
+    pitch: float, length: float, width: float, turn: float
+) -> None:
+    # Half the length and half the width of the arms; edges that fade within five pixels, as secondary electrons do.
+    side, fine = 300, 3
+    y, x = np.mgrid[0 : side * fine, 0 : side * fine] / fine
+    u = (x * np.cos(turn) + y * np.sin(turn)) / pitch
+    v = (y * np.cos(turn) - x * np.sin(turn)) / pitch
+    u, v = np.abs(u - np.rint(u)), np.abs(v - np.rint(v))
+    # Distance from the edge of the nearest arm, in pitches.
+    inside = np.maximum(np.minimum(length - u, width - v), np.minimum(width - u, length - v))
+    level = np.where(inside > 0.0, 0.4 + 0.5 * np.exp(-0.2 * pitch * np.abs(inside)), 0.3)
+    picture = cv2.resize(level, (side, side), interpolation=cv2.INTER_AREA)
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.0)
+    counts = np.random.default_rng(0).poisson(200.0 * picture)
+    found = find_lattice(counts.astype(np.float32))
+    assert isinstance(found, LatticeDetection), found.reason
+    assert found.pattern == "crosses"
+    assert found.spacing_px == pytest.approx(pitch, rel=2e-3)
+    assert found.odds > 20.0
