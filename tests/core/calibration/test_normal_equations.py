@@ -361,6 +361,7 @@ def test_the_cost_curves_with_a_tilt_as_is_said():
             assert axis @ by_first @ axis < 0.1 * abs(second)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [2, 6])
 def test_flat_views_under_parallel_projection_converge(seed):
     """The tilt of a view from above acts by its square alone; such views once stopped at the iteration limit."""

@@ -58,6 +58,7 @@ def followed(model: CalibrationModel, visits: tuple[float, ...], seed: int) -> C
     return update_calibration(model, views, image_size=size, axis=AXIS, ageing=0.0).model
 
 
+@pytest.mark.long
 def test_the_plan_predicts_what_its_views_bring(poor: CalibrationModel) -> None:
     planned = plan(poor, 1e-6, 4)
     assert planned.largest == pytest.approx(worst(poor), rel=1e-6)

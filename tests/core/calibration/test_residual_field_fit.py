@@ -150,6 +150,7 @@ def test_a_field_that_is_not_worthwhile_leaves_no_trace():
     np.testing.assert_array_equal(auto.model.covariance, off.model.covariance)
 
 
+@pytest.mark.long
 def test_held_out_agrees_with_a_new_calibration(with_field):
     """One Gauss-Newton step leaves a magnification out as well as a calibration that never saw it."""
     result, g = with_field, CALIBRATED[3]

@@ -131,6 +131,7 @@ def test_contradictions_and_impossible_ageing_are_refused(calibrated: Calibratio
         update(calibrated, SEM.camera_at, 62, ageing=0.5)
 
 
+@pytest.mark.long
 def test_the_residual_field_keeps_its_values_and_its_uncertainty() -> None:
     """It is taken out of the views as it is, so that they say nothing of it."""
     before = calibrate_views(

@@ -89,7 +89,7 @@ def photographed(rng: np.random.Generator, mean: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_a_hole_or_a_deposit_with_more_contrast_than_the_lines_hides_no_others(seed: int) -> None:
     rng = np.random.default_rng(seed)
     side, period = 400, float(rng.uniform(12.0, 50.0))
@@ -106,7 +106,7 @@ def test_a_hole_or_a_deposit_with_more_contrast_than_the_lines_hides_no_others(s
 
 
 @pytest.mark.parametrize("period", [16.0, 30.0, 64.0])
-@pytest.mark.parametrize("turn", [0.3, 1.1, 2.2])
+@pytest.mark.parametrize("turn", [0.3, 2.2])
 def test_bright_edges_at_even_distances_are_not_taken_for_lines(period: float, turn: float) -> None:
     # Faces and gaps are of one width, and what tells them is a twentieth of the contrast of the edges.
     off, x, _ = phase_of_lines(384, period, turn)

@@ -44,6 +44,7 @@ def test_a_tool_that_was_there_from_the_start_is_left_out_where_the_specimen_is_
     assert sum(accepted) < 5
 
 
+@pytest.mark.long
 def test_a_part_without_structure_is_refused_rather_than_guessed() -> None:
     frames, _, _ = draw(KINDS["tool over gold from the start"], 101)
     blank = frames[0].copy()
