@@ -61,7 +61,7 @@ PATTERN_NAMES = {
 }
 
 # What is taken for likely where nothing else decides, first to last.
-_COMMONEST: tuple[Pattern, ...] = ("chess", "dots", "lines", "crosses")
+_COMMONEST: dict[Pattern, int] = {"chess": 0, "dots": 1, "lines": 1, "crosses": 2}
 # Harmonics up to this order: with more, small spacings would be judged by noise.
 ORDERS = 4
 # Ratio of the misfits of a pattern and of the best one up to which both are possible: with 28
@@ -168,7 +168,7 @@ class CellShapes:
         ratio = COMPARABLE if shape.pattern == "chess" else AMBIGUOUS
         if shape.misfit > ratio * self._least.misfit:
             return len(_COMMONEST), shape.misfit
-        return _COMMONEST.index(shape.pattern), shape.misfit
+        return _COMMONEST[shape.pattern], shape.misfit
 
     def odds_against(self, pattern: Pattern) -> float:
         """Return how many times as likely the best pattern is; the harmonics have independent, normal errors."""
@@ -261,9 +261,10 @@ def _shapes() -> _Shapes:
     for size in map(float, SIZES):
         # Openings wider than this leave lines between them; narrower ones are square dots.
         squares: Pattern = "lines" if size >= LINES_LEAST else "dots"
+        # With rims, pads and wide bars could not be told apart.
+        add(squares, size, _square(size, h, k))
         for rim, dimness in _list_rims(size):
             add("dots", size, _disc(size, radius) - dimness * _disc(size - 2.0 * rim, radius))
-            add(squares, size, _square(size, h, k) - dimness * _square(size - 2.0 * rim, h, k))
     for arm in map(float, 2.0 * ARM_LENGTHS):
         for width in map(float, ARM_WIDTHS[arm > 1.5 * ARM_WIDTHS]):
             for rim, dimness in _list_rims(width):
