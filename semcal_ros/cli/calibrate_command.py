@@ -203,6 +203,8 @@ def _echo_result(done: RecordingCalibration) -> None:
     odds = [view.detection.odds for view in done.collected.found if view.detection.odds > 0.0]
     if patterns:
         least = f", by odds of {describe_odds(min(odds))}" if odds else ""
+        if odds and min(odds) < 1.0:
+            least = f", although another kind fits better in places, by odds of {describe_odds(1.0 / min(odds))}"
         click.echo(f"the grid: {' and '.join(patterns)}{least}")
     click.echo(
         f"{statistics['views']} of {counted(total, 'view')}, {counted(statistics['corners'], 'corner')}, "
