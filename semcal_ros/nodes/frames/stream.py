@@ -277,8 +277,9 @@ class FrameInput:
     ) -> StreamFrame | None:
         """Return the frame of a message, None for the first one of a stream with a data bar: the next decides."""
         pixels, encoding = decoded_image(message)
-        self._look_for_light(pixels)
         image = self._without_databar(pixels)
+        # The text of a bar is no light: while it is not known whether there is one, the upper half has none.
+        self._look_for_light(pixels[: (len(pixels) + 1) // 2] if image is None else image)
         if image is None:
             return None
         stamp_ns = stamp_ns_from_msg(message)

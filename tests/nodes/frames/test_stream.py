@@ -286,6 +286,13 @@ def test_a_data_bar_that_the_configuration_does_not_tell_of_is_cut_off_and_said_
     assert bench.input.conditions() == []
 
 
+@pytest.mark.parametrize("rows", [None, 40])
+def test_a_blanked_beam_is_told_above_the_text_of_a_data_bar(rows: int | None) -> None:
+    bench = Bench(databar_rows=rows)
+    bench.receive(1.0, image=with_bar(np.zeros_like(scanned()), 40, "5.0 kV 10 um"))
+    assert bench.input.conditions() == ["the image is even: all grey levels are 0"]
+
+
 def test_a_stated_data_bar_of_no_rows_stays() -> None:
     bench = Bench(databar_rows=0)
     image = with_bar(scanned(), 40, "5.0 kV 10 um")
