@@ -31,7 +31,12 @@ from semcal_ros.cli.options import (
     squares_option,
 )
 from semcal_ros.cli.output import echo_json, echo_table
-from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, ViewPlan, plan_views
+from semcal_ros.core.calibration.judgement.plan import (
+    PLANNED_DIRECTIONS_RAD,
+    PLANNED_TILTS_RAD,
+    ViewPlan,
+    plan_views,
+)
 from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
@@ -103,12 +108,20 @@ def command(
 def _echo_plan(plan: ViewPlan, target: float) -> None:
     click.echo(f"now: nm per px known to {100.0 * plan.largest:.3f} % at {plan.at:.0f}x, the worst")
     if plan.visits:
-        tilts = ", ".join(f"{math.degrees(tilt):.0f}" for tilt in PLANNED_TILTS_RAD)
+        angles = PLANNED_DIRECTIONS_RAD if plan.is_grating else PLANNED_TILTS_RAD
+        degrees = ", ".join(f"{math.degrees(angle):.0f}" for angle in angles)
         click.echo(
-            f"visit in this order, each with views tilted by {tilts} degrees, differently turned:"
+            f"visit in this order, each with untilted views, the grating turned to {degrees} degrees:"
+            if plan.is_grating
+            else f"visit in this order, each with views tilted by {degrees} degrees, differently turned:"
         )
         echo_table(
-            ["magnification", "squares um", "then %", "worst at"],
+            [
+                "magnification",
+                "pitch um" if plan.is_grating else "squares um",
+                "then %",
+                "worst at",
+            ],
             [
                 [
                     f"{v.magnification:.0f}",

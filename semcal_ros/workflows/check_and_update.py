@@ -42,6 +42,7 @@ from semcal_ros.workflows.inputs import (
     OnProgress,
     Source,
     check_positives,
+    choose_pattern,
     count_frames,
     ignore_progress,
     open_source,
@@ -100,7 +101,8 @@ def check(
     untilted
         Views without tilt, by number or by file name; ``"auto"`` or ``"none"``.
     pattern
-        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`.
+        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`;
+        ``"auto"`` is a grating where the calibration was made with one.
     on_progress
         Called with the stage, the number of frames done, and that of all frames.
 
@@ -268,7 +270,7 @@ def _see(
             named_frames(opened, note_frame),
             on_progress=advance,
             keep_images=False,
-            pattern=pattern,
+            pattern=choose_pattern(pattern, model),
         )
         notes = (*opened.notes, *conditions.notes)
     return _arrange(found, rejected, microscope, sizes, untilted, notes, frames)

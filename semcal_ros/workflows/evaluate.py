@@ -34,6 +34,7 @@ from semcal_ros.workflows.inputs import (
     OnProgress,
     Source,
     check_positives,
+    choose_pattern,
     count_frames,
     ignore_progress,
     open_source,
@@ -128,7 +129,8 @@ def evaluate(
     squares_m
         Sides of the squares of the grid, or pitches, in place of those of the configuration, m.
     pattern
-        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`.
+        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`;
+        ``"auto"`` is a grating where the calibration was made with one.
     dask
         Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers find the corners.
     on_progress
@@ -152,7 +154,7 @@ def evaluate(
             on_progress=advance,
             workers=workers if workers.elsewhere else None,
             keep_images=False,
-            pattern=pattern,
+            pattern=choose_pattern(pattern, model),
         )
         notes = (*opened.notes, *conditions.notes)
     collected = collect_views(

@@ -39,6 +39,7 @@ __all__ = [
     "OnProgress",
     "Source",
     "check_positives",
+    "choose_pattern",
     "count_frames",
     "ignore_progress",
     "open_source",
@@ -143,7 +144,8 @@ def resolve_config(
     config
         ``generic`` where there is none.
     calibration
-        Its display width is what magnifications refer to.
+        Its display width is what magnifications refer to. Its squares are the grid's, where the configuration does
+        not have them all.
     frame_time_s
         Seconds of one pass over a frame, in place of what the configuration says.
 
@@ -164,12 +166,32 @@ def resolve_config(
             expected="a MicroscopeConfig, or the name or path of a configuration",
         )
     if calibration is not None:
-        chosen = replace(chosen, display_width_m=calibration.display_width_m)
+        chosen = replace(
+            chosen,
+            display_width_m=calibration.display_width_m,
+            squares_m=_squares_of(calibration, chosen.squares_m),
+        )
     if frame_time_s is None:
         return chosen
     if chosen.scan is None:
         return replace(chosen, scan=ScanTiming(frame_time_s))
     return replace(chosen, scan=replace(chosen.scan, frame_time_s=frame_time_s))
+
+
+def _squares_of(calibration: Calibration, configured_m: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the squares of the configuration, or of the calibration if that was made with others."""
+    used_m = () if calibration.record is None else calibration.record.squares_m
+    known = all(np.any(np.isclose(side, configured_m, rtol=1e-6, atol=0.0)) for side in used_m)
+    return configured_m if known else used_m
+
+
+def choose_pattern(pattern: str, calibration: Calibration) -> str:
+    """Return what to look for: ``"auto"`` is a grating where the calibration was made with one.
+
+    ``auto`` by itself does not take a grating.
+    """
+    of_grating = calibration.record is not None and calibration.record.is_grating
+    return "grating" if pattern == "auto" and of_grating else pattern
 
 
 def open_source(

@@ -28,6 +28,7 @@ import semcal_ros
 from semcal_ros import calibrate, measure_cantilever, reconstruct, rectify, stack, track_drift
 from semcal_ros.bridge.projection import stamped_projection_from_message
 from semcal_ros.config.config import load_config
+from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording
@@ -148,6 +149,10 @@ def test_magnifications_refer_to_the_display_of_the_calibration():
     calibration = make_calibration()
     assert resolve_config(wide, calibration).display_width_m == calibration.display_width_m
     assert resolve_config(wide).display_width_m == 0.24
+    # Squares that the configuration does not have are the calibration's, as it was made with --squares.
+    assert resolve_config(wide, calibration).squares_m == wide.squares_m
+    fine = replace(calibration, record=FitRecord(1e-5, squares_m=(0.7e-6,)))
+    assert resolve_config(wide, fine).squares_m == (0.7e-6,)
     assert resolve_config(wide, frame_time_s=0.5).scan.frame_time_s == 0.5
     with pytest.raises(InvalidValueError):
         resolve_config(wide, frame_time_s=-1.0)

@@ -37,7 +37,7 @@ from semcal_ros.core.calibration.judgement.scale_checks import (
 from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model, rank_findings
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.solve import JointFit, without_magnification
-from semcal_ros.core.calibration.views import GridView, RejectedView
+from semcal_ros.core.calibration.views import GridView, RejectedView, show_lines
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
     ScaleSigma,
@@ -346,7 +346,11 @@ def judge(
     poses = fit_poses(setup.views, model.at, height_sigma_m=fit.height_sigma_m, starts=fit.poses)
     held_out = _predict_held_out(setup, fit, options.method)
     findings = (*fit.findings, *list_undetermined(setup, model))
-    record = FitRecord(float(np.max(fit.height_sigma_m)), is_wide=setup.priors.is_wide)
+    record = FitRecord(
+        float(np.max(fit.height_sigma_m)),
+        is_wide=setup.priors.is_wide,
+        is_grating=show_lines(setup.views),
+    )
     if joint is not None:
         own = joint.adjustment
         findings = (*findings, *find_scale_weaknesses(setup, joint, model))

@@ -40,6 +40,7 @@ __all__ = [
     "assign_squares",
     "estimate_excess_sigma_px",
     "refuse_tilted_lines",
+    "show_lines",
     "views_from_detections",
 ]
 
@@ -441,6 +442,11 @@ def add_excess_noise(views: Sequence[GridView], sigma_px: float) -> tuple[GridVi
     return tuple(view.add_excess_noise(sigma_px) for view in views)
 
 
+def show_lines(views: Sequence[GridView]) -> bool:
+    """Whether any of the views is one of a grating, which is turned and not tilted."""
+    return any(view.across is not None for view in views)
+
+
 def refuse_tilted_lines(views: Sequence[GridView]) -> None:
     """Refuse views that the stage tilts where any of them shows parallel lines, which do not tell a tilt.
 
@@ -449,7 +455,7 @@ def refuse_tilted_lines(views: Sequence[GridView]) -> None:
     CalibrationError
         If a view is tilted, where any view is one of parallel lines.
     """
-    if not any(view.across is not None for view in views):
+    if not show_lines(views):
         return
     for view in views:
         tilt = 0.0 if view.stage is None or view.stage.tilt_rad is None else view.stage.tilt_rad

@@ -106,6 +106,8 @@ class FitRecord:
         Sides of the squares of the grid, m; empty where they are not known.
     is_wide
         Whether the views are those of a camera close to the grid, such as a photograph.
+    is_grating
+        Whether the grid consists of parallel lines, which are turned and not tilted.
     scale_shares
         What the variance of nm per pixel consists of, or None where that is not known.
     certificate
@@ -116,6 +118,7 @@ class FitRecord:
     visit_height_sigma_m: float | None = None
     squares_m: tuple[float, ...] = ()
     is_wide: bool = False
+    is_grating: bool = False
     scale_shares: ScaleShares | None = None
     certificate: Certificate | None = None
 

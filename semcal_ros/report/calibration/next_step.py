@@ -61,7 +61,7 @@ def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]
     renewed = str(path.with_name(f"{path.stem}_improved{path.suffix}"))
     return [
         (
-            "What to set and how to tilt:",
+            "What to set and how to tilt or turn:",
             shlex.join(["semcal", "plan", calibration, "--target", target, *_SAME_SESSION]),
         ),
         (

@@ -23,12 +23,17 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration.gratings import DISPLAY_WIDTH_M, Array, Microscope, draw_picture
+from semcal_ros.core.calibration.judgement.check import Verdict
+from semcal_ros.core.calibration.judgement.plan import PLANNED_DIRECTIONS_RAD, judge_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
+from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_found
+from semcal_ros.workflows.check_and_update import check, update
+from semcal_ros.workflows.evaluate import evaluate
 
 PITCH_M = 1e-6
 SCOPE = Microscope(384, 320, (1.01, 0.995), 3e-3, 0.01, 0.0)
@@ -83,9 +88,40 @@ def test_three_directions_tell_both_axes_the_skew_and_the_distortion() -> None:
 
 def test_two_directions_leave_the_skew_to_its_prior_and_say_so() -> None:
     done = calibrated([view(3000.0, turn) for turn in (0.1, 0.1 + 0.5 * np.pi, 0.12)])
-    assert any("two directions" in finding.text for finding in done.result.findings)
+    said = [finding.text for finding in done.result.findings]
+    assert any("two directions" in text for text in said)
+    # What helps with a board, a tilt or a turned scan, does not with lines, or is not what is at hand.
+    assert not any("tilt" in text or "scan rotated" in text for text in said)
     expected = pixel_m(3000.0) * np.array(SCOPE.sizes)
     assert np.allclose(done.calibration.at(3000.0).pixel_size_m, expected, rtol=2e-3)
+
+
+def test_the_advice_is_to_turn_and_its_views_bring_what_it_says() -> None:
+    first = [view(3000.0, turn) for turn in (0.1, 0.7, 0.12)]
+    done = calibrated(first)
+    verdict = judge_calibration(done.calibration)
+    assert "untilted, turned to 0, 60 and 120 degrees" in verdict.advise()
+    assert verdict.next_visit is not None
+    with_more = calibrated([*first, *(view(3000.0, 0.3 + turn) for turn in PLANNED_DIRECTIONS_RAD)])
+    reached = worst_pixel_size(with_more.calibration)[0]
+    # 1.5 % before, from what two directions leave open. Planned are sharp pictures, with points of 0.05 px.
+    assert reached < 0.2 * verdict.largest
+    assert reached == pytest.approx(verdict.next_visit.largest, rel=0.5)
+
+
+def test_what_was_a_grating_is_looked_for_as_one() -> None:
+    done = calibrated([view(3000.0, turn) for turn in THREE])
+    pictures = [
+        draw_picture(SCOPE, pixel_m(3000.0), PITCH_M, turn, np.random.default_rng(k))
+        for k, turn in enumerate((0.4, 1.5, 2.6))
+    ]
+    # Neither pattern nor pitch is told: the calibration knows both.
+    source = [(picture, 3000.0, float(k)) for k, picture in enumerate(pictures)]
+    assert check(done.calibration, source).result.verdict is Verdict.VALID
+    assert evaluate(done.calibration, source).views == 3
+    renewed = update(done.calibration, source, ageing=1e-4)
+    assert renewed.calibration.record is not None
+    assert renewed.calibration.record.is_grating
 
 
 def test_one_direction_is_refused() -> None:

@@ -27,7 +27,7 @@ from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.method_fit import Finding, rank_findings
-from semcal_ros.core.calibration.views import FoundView, RejectedView
+from semcal_ros.core.calibration.views import FoundView, RejectedView, show_lines
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
@@ -327,7 +327,7 @@ def _check_field(result: CalibrationResult) -> list[Finding]:
             )
         )
     largest = float(np.max(compute_tilts_deg(result)[0]))
-    if largest < _SMALL_TILT_DEG and not _shows_lines(result):
+    if largest < _SMALL_TILT_DEG and not show_lines(result.views):
         found.append(
             Finding(
                 f"no view is tilted by more than {largest:.1f} degrees: scale and height are hardly "
@@ -376,11 +376,6 @@ def _check_pattern(result: CalibrationResult) -> list[Finding]:
     return []
 
 
-def _shows_lines(result: CalibrationResult) -> bool:
-    """Whether the grid is a grating, which is turned and not tilted."""
-    return any(view.across is not None for view in result.views)
-
-
 def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
     """Check the magnification at which positions are least certain."""
     model = result.model
@@ -399,7 +394,7 @@ def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
             Finding(
                 f"around {float(f'{g:.2g}'):.10g}x positions at the edge of the image are uncertain "
                 f"by {worst[g]:.1f} px relative to its centre: take more images there, "
-                f"{'turned' if _shows_lines(result) else 'tilted'} in different directions",
+                f"{'turned' if show_lines(result.views) else 'tilted'} in different directions",
                 worst[g],
                 magnification=g,
             )

@@ -14,10 +14,11 @@
 
 """What a calibration is good for, and which views to record next so that nm per pixel becomes more certain.
 
-Each candidate is a visit of a magnification with three views of the grid, of which two are tilted. What it would tell
-about the camera is its Fisher information, with poses, repeatability, height and drift eliminated. The visits
-are chosen one after the other, each the one that lowers the largest 1-sigma of nm per pixel over the range the
-most: greedy experimental design (Fedorov, Theory of Optimal Experiments, 1972, for the G-criterion).
+Each candidate is a visit of a magnification with three views of the grid, of which two are tilted; of a grating, with
+three directions of its lines. What it would tell about the camera is its Fisher information, with poses, repeatability,
+height and drift eliminated. The visits are chosen one after the other, each the one that lowers the largest 1-sigma of
+nm per pixel over the range the most: greedy experimental design (Fedorov, Theory of Optimal Experiments, 1972, for the
+G-criterion).
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
 from semcal_ros.core.calibration.estimator.problem import HELD_SIGMA, REFERENCE_WIDTH_PX, Priors
 from semcal_ros.core.calibration.judgement.revision import CHANGING, record_of
 from semcal_ros.core.calibration.judgement.update import ageing_sigmas, change_directions
+from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
@@ -47,6 +49,7 @@ from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.wording import rounded_magnification
 
 __all__ = [
+    "PLANNED_DIRECTIONS_RAD",
     "PLANNED_TILTS_RAD",
     "PlannedVisit",
     "Verdict",
@@ -59,6 +62,8 @@ __all__ = [
 PLANNED_TILTS_RAD = (0.0, math.radians(20.0), math.radians(40.0))
 # In-plane turns of these views: different ones, so that aspect and skew are seen.
 _TURNS_RAD = (0.2, 1.3, 2.4)
+#: Directions of the lines of a grating in the views of a planned visit: the most different ones.
+PLANNED_DIRECTIONS_RAD = (0.0, math.radians(60.0), math.radians(120.0))
 # Candidates, and magnifications at which the sigma is judged.
 _CANDIDATES, _JUDGED = 15, 25
 # A plan of more visits is a new calibration.
@@ -79,7 +84,7 @@ class PlannedVisit:
     magnification
         The magnification to set.
     square_m
-        Side of the squares to look at.
+        Side of the squares to look at, or pitch of the grating.
     largest, at
         Largest relative 1-sigma of nm per pixel in the range after it, and the magnification where that is.
     """
@@ -104,6 +109,9 @@ class ViewPlan:
         What no number of views goes below at any magnification: repeatability, squares, height.
     reached
         Whether the target is met at the end.
+    is_grating
+        Whether the visits are those of a grating, untilted, its lines in :data:`PLANNED_DIRECTIONS_RAD`; else of a
+        grid, tilted by :data:`PLANNED_TILTS_RAD`.
     """
 
     visits: tuple[PlannedVisit, ...]
@@ -111,6 +119,7 @@ class ViewPlan:
     at: float
     floor: float
     reached: bool
+    is_grating: bool = False
 
 
 def plan_views(
@@ -189,7 +198,13 @@ def plan_views(
         visits.append(
             PlannedVisit(float(candidates[best]), seen[best], largest, float(judged[worst]))
         )
-    return ViewPlan(tuple(visits), *start, float(floor.max()), largest <= target)
+    return ViewPlan(
+        tuple(visits), *start, float(floor.max()), largest <= target, _is_of_grating(model)
+    )
+
+
+def _is_of_grating(model: CalibrationModel) -> bool:
+    return model.record is not None and model.record.is_grating
 
 
 def _mean_variance(precision: Array, rows: Array, fixed: Array) -> float:
@@ -237,13 +252,20 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
     step = square_m * max(1, math.ceil(1.5 * field / square_m / (2 * _MOST_CORNERS_ACROSS)))
     index = (np.arange(count) - 0.5 * (count - 1)) * step
     board = np.stack(np.meshgrid(index, index), axis=-1).reshape(-1, 2)
-    for tilt, turn in zip(PLANNED_TILTS_RAD, _TURNS_RAD, strict=True):
+    of_lines = _is_of_grating(model)
+    tilts = (0.0,) * len(PLANNED_DIRECTIONS_RAD) if of_lines else PLANNED_TILTS_RAD
+    turns = PLANNED_DIRECTIONS_RAD if of_lines else _TURNS_RAD
+    for tilt, turn in zip(tilts, turns, strict=True):
         rotation = _tilt(tilt) @ _turn(turn)
         points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T
         xy = camera.project(points)
         inside = np.all((xy >= 0.0) & (xy <= (camera.width - 1.0, camera.height - 1.0)), axis=1)
         sigmas = np.full(int(inside.sum()), _CORNER_SIGMA_PX)
-        views.append(GridView(g, board[inside], xy[inside], sigmas, square_m=square_m))
+        view = GridView(g, board[inside], xy[inside], sigmas, square_m=square_m)
+        if of_lines:
+            along = camera.project(points + step * rotation[:, 1]) - xy
+            view = _as_lines(view, along[inside], unknown_px=camera.width)
+        views.append(view)
         rotations.append(rotation)
     problem = make_problem(
         views,
@@ -266,8 +288,21 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
         y / camera.height - 0.5,
     )
     state = State(np.ones(1), np.stack(rotations), np.zeros((len(views), 3)))
-    result = refine(replace(problem, effects=effects), state, max_iterations=0)
-    return result.information[0]
+    problem = replace(problem, effects=effects)
+    if of_lines:
+        flat = [True] * len(views)
+        known = attitudes([None] * len(views), flat, StageAxis(), usual.untilted_sigma_rad)
+        problem = replace(problem, attitudes=known)
+    return refine(problem, state, max_iterations=0).information[0]
+
+
+def _as_lines(view: GridView, along: Array, unknown_px: float) -> GridView:
+    """The view of points of which only the position across lines is known, which run along ``along`` (n, 2), px."""
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    own = view.sigma_px[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
+    spread = own + unknown_px**2 * along[:, :, None] * along[:, None, :]
+    return replace(view, covariance_px2=spread, untilted=True, across=across)
 
 
 def _tilt(angle: float) -> Array:
@@ -302,6 +337,8 @@ class Verdict:
         The visit that lowers it most; None where none is worth it, or the grid is not known.
     conditions
         What it holds for: voltage, working distance and date.
+    is_grating
+        Whether the views are those of a grating.
     """
 
     low: float
@@ -312,6 +349,7 @@ class Verdict:
     floor: float
     next_visit: PlannedVisit | None
     conditions: str = ""
+    is_grating: bool = False
 
     @property
     def pixel_sigma_m(self) -> float:
@@ -341,10 +379,14 @@ class Verdict:
         """Return what to record next; empty if that is not known."""
         visit = self.next_visit
         if visit is not None:
-            tilts = " and ".join(f"{math.degrees(t):.0f}" for t in PLANNED_TILTS_RAD if t > 0.0)
+            what, how = "squares", "flat and tilted by"
+            angles = [t for t in PLANNED_TILTS_RAD if t > 0.0]
+            if self.is_grating:
+                what, how, angles = "lines", "untilted, turned to", list(PLANNED_DIRECTIONS_RAD)
+            *first, last = [f"{math.degrees(angle):.0f}" for angle in angles]
             return (
-                f"to improve it most: views of the {1e6 * visit.square_m:g} um squares at "
-                f"{rounded_magnification(visit.magnification)}, flat and tilted by {tilts} degrees, "
+                f"to improve it most: views of the {1e6 * visit.square_m:g} um {what} at "
+                f"{rounded_magnification(visit.magnification)}, {how} {', '.join(first)} and {last} degrees, "
                 f"bring it to {100.0 * visit.largest:.2g} % (see semcal plan)"
             )
         if not math.isfinite(self.floor):
@@ -373,4 +415,14 @@ def judge_calibration(model: CalibrationModel) -> Verdict:
             if first is not None and first.largest < (1.0 - _WORTH) * largest:
                 visit = first
     conditions = model.provenance.describe_essentials()
-    return Verdict(float(low), float(high), largest, at, size_m, floor, visit, conditions)
+    return Verdict(
+        float(low),
+        float(high),
+        largest,
+        at,
+        size_m,
+        floor,
+        visit,
+        conditions,
+        _is_of_grating(model),
+    )

@@ -27,6 +27,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.solve import JointFit
+from semcal_ros.core.calibration.views import show_lines
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
 __all__ = [
@@ -211,6 +212,11 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
             )
         )
     out += _find_stage_errors(setup, fit, model)
+    remedy = (
+        "add views with the grating turned to other directions"
+        if show_lines(setup.views)
+        else "record also with the scan rotated by 90 degrees, or give the stage's tilt"
+    )
     for name, label in (("aspect", "aspect ratio"), ("skew", "skew")):
         limit = _UNDETERMINED * setup.change_prior_of(name)
         weak = {g: sigma for g, sigma in sigmas[name].items() if sigma > limit}
@@ -220,8 +226,7 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
         out.append(
             Finding(
                 f"scale: the views do not determine the {label} at magnification "
-                f"{', '.join(f'{g:g}' for g in weak)}, where it is held by its prior; record also with "
-                "the scan rotated by 90 degrees, or give the stage's tilt",
+                f"{', '.join(f'{g:g}' for g in weak)}, where it is held by its prior; {remedy}",
                 cost_relative=cost,
                 magnification=where,
             )
