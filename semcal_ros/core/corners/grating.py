@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from semcal_ros.core.arrays import Array, Array32, Image, Indices, Mask
@@ -230,8 +231,8 @@ class _Spectrum:
 
     Attributes
     ----------
-    part
-        (h, w) the windowed pixels.
+    transform
+        (h, w) coefficients of the windowed pixels.
     power
         (h, w // 2 + 1) power.
     clearness
@@ -240,7 +241,7 @@ class _Spectrum:
         Frequencies, cycles per pixel.
     """
 
-    part: Array
+    transform: NDArray[np.complex128]
     power: Array
     clearness: Array
     fx: Array
@@ -248,14 +249,14 @@ class _Spectrum:
 
     def bins_from(self, frequency: Array) -> Array:
         """Return the distance of all frequencies from one, in bins."""
-        height, width = self.part.shape
+        height, width = self.transform.shape
         off = np.hypot((self.fx - frequency[0]) * width, (self.fy - frequency[1]) * height)
         return np.asarray(off)
 
     def is_aside(self, frequency: Array) -> Mask:
         """Return which frequencies are no multiples of one, within the window's lobes and the bend of the lines."""
         along = (self.fx * frequency[0] + self.fy * frequency[1]) / float(frequency @ frequency)
-        height, width = self.part.shape
+        height, width = self.transform.shape
         aside = np.hypot(
             (self.fx - along * frequency[0]) * width, (self.fy - along * frequency[1]) * height
         )
@@ -268,7 +269,7 @@ class _Spectrum:
 
     def find_divisor(self, frequency: Array, lowest: float, highest: float) -> int:
         """Return by what a frequency of the lines is to be divided, so that all of them are its multiples."""
-        height, width = self.part.shape
+        height, width = self.transform.shape
         bins = float(np.hypot(frequency[0] * width, frequency[1] * height))
         ratios = self.find_ratios(frequency, lowest, highest)
         tolerance = _OFF + _UNSURE * ratios * bins
@@ -291,7 +292,7 @@ class _Spectrum:
             off = self.bins_from(unit)
             at = np.unravel_index(np.argmax(np.where(off < _LOBE, self.clearness, 0.0)), off.shape)
             clear = self.clearness[at] > _SUBMULTIPLE and self.power[at] > _SIDE_LOBE * highest
-            if off[at] < 0.5 * _LOBE and clear and _is_everywhere(self.part, unit):
+            if off[at] < 0.5 * _LOBE and clear and self.is_everywhere(unit):
                 return divisor
         return 1
 
@@ -315,8 +316,40 @@ class _Spectrum:
             self.centre_near(np.array([self.fx[at], self.fy[at]]))
             for at in zip(rows[order], columns[order], strict=True)
         ]
-        everywhere = [f for f in centres if _is_everywhere(self.part, f)]
+        everywhere = [f for f in centres if self.is_everywhere(f)]
         return np.abs(np.array(everywhere).reshape(-1, 2) @ frequency) / own**2
+
+    def is_everywhere(self, frequency: Array) -> bool:
+        """Whether most of the image has this frequency, more than others of its size."""
+        turns = np.radians([0.0, *_OTHER_DIRECTIONS_DEG])
+        c, s = np.cos(turns), np.sin(turns)
+        x, y = frequency
+        directions = np.stack([c * x - s * y, s * x + c * y], axis=1)
+        own, *others = (self._median_amplitude(f) for f in directions)
+        return own > _EVERYWHERE * max(others)
+
+    def _median_amplitude(self, frequency: Array) -> float:
+        """Return the median amplitude over the places of the image, by the coefficients around the frequency."""
+        size = np.array(self.transform.shape)
+        period = 1.0 / float(np.linalg.norm(frequency))
+        sigma = max(_SMOOTH * period, min(float(size.min()) / _PLACES, 3.0 * period))
+        # What is beyond 3.5 standard deviations of the low pass is less than a hundredth.
+        spread = size / (2.0 * np.pi * sigma)
+        reach = np.minimum(np.ceil(3.5 * spread).astype(int), size // 2 - 1)
+        centre = frequency[::-1] * size
+        rows, columns = (
+            np.arange(-n, n + 1) + round(float(at)) for n, at in zip(reach, centre, strict=True)
+        )
+        low_pass = np.outer(
+            np.exp(-0.5 * ((rows - centre[0]) / spread[0]) ** 2),
+            np.exp(-0.5 * ((columns - centre[1]) / spread[1]) ** 2),
+        )
+        near = self.transform[np.ix_(rows % size[0], columns % size[1])]
+        places = np.abs(np.fft.ifft2(near * low_pass))
+        height, width = places.shape
+        # The window takes the outer parts down.
+        inner = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+        return float(np.median(places[inner])) * places.size
 
     def strongest_multiple(self, frequency: Array, most: int) -> int:
         """Return by what the frequency is multiplied where its power is largest; 1 unless another is far larger."""
@@ -334,16 +367,17 @@ def _compute_spectrum(image: Image) -> _Spectrum:
     part = image[top : top + height, left : left + width].astype(np.float64)
     window = np.outer(np.hanning(height), np.hanning(width))
     part = (part - float((part * window).sum() / window.sum())) * window
-    power = np.abs(np.fft.rfft2(part)) ** 2
+    transform = np.fft.fft2(part)
+    power = np.abs(transform[:, : width // 2 + 1]) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
-    return _Spectrum(part, power, power / _usual_power(power, np.hypot(fx, fy)), fx, fy)
+    return _Spectrum(transform, power, power / _usual_power(power, np.hypot(fx, fy)), fx, fy)
 
 
 def _find_wave(image: Image, octave: int) -> _Wave | None:
     """Find the strongest frequency in the middle of an image; None where it has no contrast."""
     spectrum = _compute_spectrum(image)
     radius = np.hypot(spectrum.fx, spectrum.fy)
-    lowest = _LEAST_PERIODS / min(spectrum.part.shape)
+    lowest = _LEAST_PERIODS / min(spectrum.transform.shape)
     allowed = (radius > lowest) & (radius < 1.0 / _LEAST_PERIOD_PX)
     if not np.any(allowed) or float(spectrum.power[allowed].max()) <= 0.0:
         return None
@@ -366,25 +400,6 @@ def _find_wave(image: Image, octave: int) -> _Wave | None:
         octave,
         spectrum.strongest_multiple(frequency, divisor),
     )
-
-
-def _is_everywhere(part: Array, frequency: Array) -> bool:
-    """Whether most of a windowed image has this frequency, more than others of its size."""
-    period = float(1.0 / np.linalg.norm(frequency))
-    step = max(1, int(period / (1.6 * _LEAST_PERIOD_PX)))
-    height, width = (side // step for side in part.shape)
-    small = np.asarray(
-        cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
-    )
-    turns = np.radians([0.0, *_OTHER_DIRECTIONS_DEG])
-    c, s = np.cos(turns), np.sin(turns)
-    x, y = step * frequency
-    directions = np.stack([c * x - s * y, s * x + c * y], axis=1)
-    # The window takes the outer parts down.
-    inner = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    sigma = max(_SMOOTH * period / step, min(min(small.shape) / _PLACES, 3.0 * period / step))
-    own, *others = (float(np.median(_demodulate(small, f, sigma)[0][inner])) for f in directions)
-    return own > _EVERYWHERE * max(others)
 
 
 def _usual_power(power: Array, radius: Array) -> Array:
