@@ -277,7 +277,9 @@ def _record_of_notes(
             None if visits is None else float(visits),
             tuple(float(side) for side in notes.get("squares_m", ())),
             bool(priors.get("is_wide", False)),
-            ScaleShares(magnifications, tuple(shares["corners"]), tuple(shares["visits"]))
+            scale_shares=ScaleShares(
+                magnifications, tuple(shares["corners"]), tuple(shares["visits"])
+            )
             if shares
             else None,
         )

@@ -31,8 +31,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array, Image, Indices
+from semcal_ros.core.corners.crossed_waves import find_cells
 from semcal_ros.core.corners.dots_and_lines import (
     bright_cells,
+    centre_cells,
     count_regular_area,
     fit_lattice_shapes,
     grow_at_scale,
@@ -104,6 +106,7 @@ _CELL_FULL_PX = 80.0
 # Least distance of points in a reduced picture, px.
 _SPACING_MIN_PX = 10.0
 
+_NOT_SQUARE = Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")
 _POINTS = {
     "chess": "corners",
     "dots": "dots",
@@ -111,6 +114,9 @@ _POINTS = {
     "lines": "crossings",
     "grating": "places on lines",
 }
+# Logarithm of the ratio of two areas that are the same: tilts and distortions change them by less over a picture, and
+# lattices of which one has every other point of the other differ by 0.69.
+_SAME_AREA = 0.3
 # 1-sigma along the lines of a grating, in sides of the picture: a million places tell lengths along them to 10 %.
 _ALONG = 30.0
 # Departure of the lines of a grating from even distances, in these: rough edges and noise as large as the contrast make
@@ -220,23 +226,29 @@ def find_lattice(
         return _find_grating(pyramid)
     answer: Rejection[LatticeStatus] | None = None
     best: LatticeDetection | None = None
-    is_clear = False
+    shown: CellShapes | None = None
     for candidate in _rank(list(_search(pyramid))):
-        own: LatticeDetection | None = None
-        for shape in _likely_shapes(candidate, wanted):
-            found = shape if isinstance(shape, Rejection) else _measure(pyramid, candidate, shape)
-            if isinstance(found, Rejection):
-                # What is said is said of the candidate that covers most of the image.
-                answer = answer or found
-            # What is less likely must cover clearly more.
-            elif own is None or _filled_by(found) > _MORE * _filled_by(own):
-                own = found
-        if own is not None and (best is None or _filled_by(own) > _filled_by(best)):
-            best, is_clear = own, candidate.is_clear
+        own = _measure_likely(pyramid, candidate, wanted)
+        if isinstance(own, Rejection):
+            # What is said is said of the candidate that covers most of the image.
+            answer = answer or own
+        elif own is not None and (best is None or _filled_by(own) > _filled_by(best)):
+            best, shown = own, candidate.shapes
         if best is not None and candidate.filled > 0.5 * _FILLED:
             break
-    if best is not None and is_clear:
+    if best is not None and shown is not None and shown.best.misfit < _CLEAR_MISFIT:
         return best
+    # Where saddle points show no clear pattern, its frequencies tell the lattice.
+    crossed = _find_crossed(pyramid, 0.0 if shown is None else _POWER_MIN * shown.power)
+    if crossed is not None:
+        if best is not None and _repeats_with(best, crossed):
+            return best if best.pattern == "chess" or _is_square(crossed) else _NOT_SQUARE
+        # Of a chess board, the corners are elsewhere.
+        if wanted not in ("auto", "chess") or not _is_likely_chess(crossed):
+            own = _measure_likely(pyramid, crossed, wanted)
+            if isinstance(own, LatticeDetection):
+                return own
+            answer = answer or own
     # Noise between parallel lines makes lattices too.
     if wanted == "auto" and isinstance(find_lines(pyramid.level, pyramid.size), Lattice):
         return Rejection(
@@ -247,6 +259,51 @@ def find_lattice(
         return best
     what = "points" if wanted == "auto" else _POINTS[wanted]
     return answer or Rejection(LatticeStatus.NO_LATTICE, f"no grid: no regular pattern of {what}")
+
+
+def _measure_likely(
+    pyramid: _Pyramid, candidate: _Candidate, wanted: PatternChoice
+) -> LatticeDetection | Rejection[LatticeStatus] | None:
+    """Measure a candidate as what it may be; return the likeliest pattern that is found, or why there is none."""
+    answer: Rejection[LatticeStatus] | None = None
+    best: LatticeDetection | None = None
+    for shape in _likely_shapes(candidate, wanted):
+        found = shape if isinstance(shape, Rejection) else _measure(pyramid, candidate, shape)
+        if isinstance(found, Rejection):
+            answer = answer or found
+        # What is less likely must cover clearly more.
+        elif best is None or _filled_by(found) > _MORE * _filled_by(best):
+            best = found
+    return best or answer
+
+
+def _find_crossed(pyramid: _Pyramid, least_power: float) -> _Candidate | None:
+    """Return the cells of a pattern that repeats in two directions.
+
+    Parts of cells that are not alike have less than the least power.
+    """
+    places = find_cells(pyramid.level, pyramid.size)
+    if places is None or len(places.ij) < _LEAST_GROWN:
+        return None
+    cells = centre_cells(pyramid.level, places)
+    shapes = fit_lattice_shapes(pyramid.level, cells)
+    if shapes is None or shapes.power < least_power:
+        return None
+    filled = float(np.abs(np.linalg.det(cells.axes)).sum()) / (pyramid.size[0] * pyramid.size[1])
+    return _Candidate(cells, cells, shapes, filled, filled, True)
+
+
+def _repeats_with(points: LatticeDetection, candidate: _Candidate) -> bool:
+    """Whether points are as dense as the cells of a candidate; of a chess board, two squares are a cell."""
+    width, height = points.image_size
+    middle = np.linalg.norm(points.xy - 0.5 * np.array([width, height]), axis=1)
+    nearest = np.argsort(middle)[:MINIMUM_CORNERS]
+    maps = fit_local_maps(points.ij[nearest], points.ij, points.xy, leave_out_self=False)
+    cell = float(np.median(np.abs(np.linalg.det(maps.axes))))
+    if points.pattern == "chess":
+        cell *= 2.0
+    other = float(np.median(np.abs(np.linalg.det(candidate.corners.axes))))
+    return abs(np.log(cell / other)) < _SAME_AREA
 
 
 def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStatus]:
@@ -379,6 +436,18 @@ def _rank(found: list[_Candidate]) -> list[_Candidate]:
     return sorted(kept, key=lambda c: c.regular, reverse=True)[:_LATTICES_TRIED]
 
 
+def _is_likely_chess(candidate: _Candidate) -> bool:
+    return candidate.shapes is not None and candidate.shapes.best.pattern == "chess"
+
+
+def _is_square(candidate: _Candidate) -> bool:
+    """Whether the cells look as those of a square lattice do, or may be those of a chess board."""
+    shapes = candidate.shapes
+    assert shapes is not None
+    may_be_chess = shapes.allows("chess") and not candidate.is_mixture
+    return shapes.asymmetry <= _ASYMMETRY_MAX or may_be_chess
+
+
 def _likely_shapes(
     candidate: _Candidate, wanted: PatternChoice
 ) -> list[CellShape | Rejection[LatticeStatus]]:
@@ -387,8 +456,8 @@ def _likely_shapes(
     if shapes is None:
         # Of the few squares of a small board, none may be in view as a whole.
         return [CellShape("chess", True, 1.0, 0.0, 0.0)] if wanted in ("auto", "chess") else []
-    if shapes.asymmetry > _ASYMMETRY_MAX and not shapes.allows("chess"):
-        return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
+    if not _is_square(candidate):
+        return [_NOT_SQUARE]
     if wanted == "auto":
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
         if candidate.is_mixture:

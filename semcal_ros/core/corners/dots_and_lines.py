@@ -23,7 +23,7 @@ its squares are the cells of the pattern.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from semcal_ros.core.corners.lattice import STEPS, Lattice, enlarged, grow_best_
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.neighbour_consistency import find_consistent
-from semcal_ros.core.corners.pattern import CellShape, CellShapes, fit_shapes
+from semcal_ros.core.corners.pattern import CellShape, CellShapes, find_motif, fit_shapes
 from semcal_ros.core.corners.saddle import SaddlePoints, find_saddles
 from semcal_ros.core.corners.unit_cell import (
     CellFit,
@@ -56,6 +56,7 @@ from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = [
     "bright_cells",
+    "centre_cells",
     "count_regular_area",
     "fit_lattice_shapes",
     "grow_at_scale",
@@ -201,6 +202,15 @@ def fit_lattice_shapes(level: Callable[[int], Array32], cells: Lattice) -> CellS
     """
     cell = _mean_cell(level, cells)
     return None if cell is None else fit_shapes(cell)
+
+
+def centre_cells(level: Callable[[int], Array32], cells: Lattice) -> Lattice:
+    """Return the cells of a lattice of any equal places, moved to their motif."""
+    cell = _mean_cell(level, cells)
+    if cell is None:
+        return cells
+    shift = np.array(find_motif(cell))
+    return replace(cells, xy=cells.xy + np.einsum("a,nab->nb", shift, cells.axes))
 
 
 def _mean_cell(level: Callable[[int], Array32], cells: Lattice) -> UnitCell | None:

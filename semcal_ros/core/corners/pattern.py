@@ -44,6 +44,7 @@ __all__ = [
     "PatternChoice",
     "check_pattern",
     "describe_odds",
+    "find_motif",
     "fit_shapes",
 ]
 
@@ -87,11 +88,13 @@ DIMNESS: Array = np.array([0.25, 0.5, 0.75])
 LINES_LEAST = 0.55
 # Where a relief may have shifted the centre of symmetry to, in cells.
 RELIEF_SHIFTS: Array = np.linspace(-0.2, 0.2, 9)
+# The middle of a motif is looked for in such steps, in cells: within the reach of the centre of symmetry.
+MOTIF_STEP = 1.0 / 12.0
 # Of so many shapes, one is enough to find the centre under a relief.
 SOME = 7
 # By how much a relief has to lower what is left of the power: noise does so once in 10 000 cells, by its four numbers
-# among 56 (F test); 1.6 times.
-RELIEF_GAIN = 2.0
+# among 56 (F test).
+RELIEF_GAIN = 1.6
 # Least part of the power that is at no multiples of one frequency: parallel lines, which the derivative of any shape
 # explains, have 0.005, and crossed ones of which one direction is hardly seen 0.05.
 RELIEF_ASIDE = 0.03
@@ -137,8 +140,8 @@ class CellShapes:
         Part of the power by which the cell differs from its mirror image. It is small on a square
         lattice; dots on a hexagonal one are ellipses in the coordinates of the lattice.
     power
-        Power of the cell in squared grey values. It is small where cells of a wrong lattice average
-        to grey.
+        Power of the cell in squared grey values, without its odd part where it has no relief. It is small where cells
+        of a wrong lattice average to grey.
     """
 
     chess: CellShape
@@ -365,6 +368,15 @@ def fit_shapes(cell: UnitCell) -> CellShapes:
         )
 
     return CellShapes(best("chess"), best("dots"), best("crosses"), best("lines"), asymmetry, even)
+
+
+def find_motif(cell: UnitCell) -> tuple[float, float]:
+    """Return where in a cell the motif is that some shape describes best, lit from one side or not; (u, v) in cells."""
+    h, k = _harmonics()
+    steps = np.arange(0.0, 1.0, MOTIF_STEP)
+    return _shapes().some.find_centre(
+        cell.coefficients[h, k], [(float(u), float(v)) for u in steps for v in steps]
+    )
 
 
 def _move(u: float, v: float) -> NDArray[np.complex128]:

@@ -1,0 +1,244 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Find the cells of a pattern that repeats in two directions by its spatial frequencies and their local phases.
+
+Whatever the cells look like, the frequencies of a lattice are sums of whole numbers of two of them. The phases of two
+strong ones say where in its cell each place is, also where thin outlines, edges that are bright on one side, or film
+between weak lines leave no regular saddle points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Array32, Indices, Mask
+from semcal_ros.core.corners.lattice import Lattice, enlarged
+from semcal_ros.core.corners.local_phase import follow_phase
+from semcal_ros.core.corners.spectrum import (
+    LEAST_PERIOD_PX,
+    LEAST_PERIODS,
+    PART_PX,
+    Spectrum,
+    clip_levels,
+    compute_spectrum,
+)
+
+__all__ = ["find_cells"]
+
+# Power over what is usual, from which a frequency counts: that of noise has an exponential distribution, of which a
+# quarter is below 0.29 means, and exceeds this once in 10^12 values.
+_CLEAR = 100.0
+# Frequencies that are looked at; the lowest of their parts, sums and differences, of which two are tried as a basis;
+# and the least parts of them: of thin lines any harmonics may be the strong ones.
+_MOST, _TRIED, _PARTS = 24, 48, 3
+# A basis: the sine of the angle between its frequencies, and the ratio of their lengths; a tilt of 55 degrees makes a
+# square 1.75 times as long as wide, and seen along the diagonal its angle 60 degrees.
+_LEAST_SINE, _LONGEST = 0.7, 1.9
+# How far frequencies may be from those of the basis, in bins, and as a part of them where a distortion bends lines.
+_OFF, _UNSURE = 1.0, 0.02
+# Part of the frequencies, by the roots of their clearness, that the basis has to explain: a foreign one is debris.
+_EXPLAINED = 0.95
+# The image with all grey levels, and with clipped ones, in which a hole weighs no more than the lines.
+_PREPARED: tuple[Callable[[Array32], Array32], ...] = (np.asarray, clip_levels)
+# Of so many of the clearest frequencies, the lowest are followed: distortions and waves change their phases least.
+_CLEAREST = 8
+# Newton steps from an even lattice.
+_STEPS = 6
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """Two frequencies (rows), cycles per pixel, and the multiples (n, 2) that others are of them."""
+
+    frequencies: Array
+    multiples: Indices
+
+
+def find_cells(level: Callable[[int], Array32], size: tuple[int, int]) -> Lattice | None:
+    """Find cells of a pattern that repeats in two directions; None if it does not.
+
+    Parameters
+    ----------
+    level
+        The image reduced by powers of two.
+    size
+        (width, height) of the image, px.
+
+    Returns
+    -------
+    The lattice of equal places in its cells, of which it does not say which they are. Places are good to a tenth of
+    the period.
+    """
+    octaves = range(max(0, int(np.ceil(np.log2(max(size) / PART_PX)))) + 1)
+    for octave in octaves:
+        spectra = [compute_spectrum(prepare(level(octave))) for prepare in _PREPARED]
+        frequencies = _list_frequencies(spectra)
+        basis = _find_basis(frequencies, np.array(spectra[0].transform.shape[::-1]))
+        if basis is None:
+            continue
+        for prepare in _PREPARED:
+            cells = _follow(level, prepare, octave, basis, frequencies.values)
+            if cells is not None:
+                return cells
+    return None
+
+
+@dataclass(frozen=True)
+class _Frequencies:
+    """Frequencies (n, 2), cycles per pixel, the clearest first, and the roots (n,) of their clearness."""
+
+    values: Array
+    roots: Array
+
+
+def _list_frequencies(spectra: list[Spectrum]) -> _Frequencies:
+    """Return the frequencies of an image with all grey levels and with clipped ones."""
+    found: list[tuple[float, Array]] = []
+    size = np.array(spectra[0].transform.shape[::-1])
+    for spectrum in spectra:
+        radius = np.hypot(spectrum.fx, spectrum.fy)
+        among = radius > LEAST_PERIODS / min(spectrum.transform.shape)
+        among &= (radius < 1.0 / LEAST_PERIOD_PX) & (spectrum.clearness > _CLEAR)
+        for own in spectrum.find_frequencies(among, _MOST):
+            clear = float(spectrum.clearness[spectrum.bins_from(own) < 2.0].max(initial=_CLEAR))
+            found.append((clear, own))
+    found.sort(key=lambda entry: entry[0], reverse=True)
+    values = np.array([own for _, own in found]).reshape(-1, 2)
+    kept = _find_distinct(values, size, len(values))
+    return _Frequencies(values[kept], np.sqrt([found[k][0] for k in kept]))
+
+
+def _find_distinct(frequencies: Array, size: Array, most: int) -> list[int]:
+    """Return which (n, 2) frequencies are not near one before, or its opposite; at most so many."""
+    kept: list[int] = []
+    for k, own in enumerate(frequencies):
+        others = frequencies[kept]
+        near = np.minimum(_bins(own - others, size), _bins(own + others, size))
+        if near.min(initial=np.inf) > 2.0 * _OFF:
+            kept.append(k)
+        if len(kept) == most:
+            break
+    return kept
+
+
+def _find_basis(frequencies: _Frequencies, size: Array) -> _Basis | None:
+    """Return the widest two frequencies that the others are multiples of; ``size`` is (width, height)."""
+    values, roots = frequencies.values, frequencies.roots
+    if len(values) < 2:
+        return None
+    pairs = [a + sign * b for a, b in combinations(values, 2) for sign in (1.0, -1.0)]
+    parts = [values / n for n in range(1, _PARTS + 1)]
+    tried = np.concatenate([*parts, np.array(pairs)])
+    length = np.linalg.norm(tried, axis=1)
+    order = np.argsort(length, kind="stable")
+    tried = tried[order[length[order] > LEAST_PERIODS / size.min()]]
+    best: _Basis | None = None
+    largest = 0.0
+    for a, b in combinations(tried[_find_distinct(tried, size, _TRIED)], 2):
+        area = abs(float(a[0] * b[1] - a[1] * b[0]))
+        shorter, longer = sorted((float(np.linalg.norm(a)), float(np.linalg.norm(b))))
+        acute = area < _LEAST_SINE * shorter * longer
+        if acute or longer > _LONGEST * shorter or area <= 1.02 * largest:
+            continue
+        basis = np.stack([a, b])
+        multiples = np.rint(values @ np.linalg.inv(basis))
+        off = _bins(values - multiples @ basis, size)
+        orders = np.maximum(1.0, np.abs(multiples).sum(axis=1))
+        fits = off < _OFF * orders + _UNSURE * _bins(values, size)
+        if roots[fits].sum() < _EXPLAINED * roots.sum():
+            continue
+        if np.linalg.matrix_rank(multiples[fits]) == 2:
+            refined = np.linalg.lstsq(multiples[fits], values[fits], rcond=None)[0]
+            whole = np.where(fits[:, None], multiples, 0.0).astype(np.intp)
+            best, largest = _Basis(refined, whole), area
+    return None if best is None else _reduce(best)
+
+
+def _reduce(basis: _Basis) -> _Basis:
+    """Return the shortest basis of the same frequencies (Gauss)."""
+    change = np.eye(2, dtype=np.intp)
+    while True:
+        own = change @ basis.frequencies
+        if own[0] @ own[0] > own[1] @ own[1]:
+            change, own = change[::-1], own[::-1]
+        times = int(np.rint(own[0] @ own[1] / (own[0] @ own[0])))
+        if times == 0:
+            break
+        change = np.stack([change[0], change[1] - times * change[0]])
+    inverse = np.rint(np.linalg.inv(change)).astype(np.intp)
+    return _Basis(change @ basis.frequencies, basis.multiples @ inverse)
+
+
+def _bins(frequencies: Array, bins: Array) -> Array:
+    return np.asarray(np.linalg.norm(frequencies * bins, axis=-1))
+
+
+def _follow(
+    level: Callable[[int], Array32],
+    prepare: Callable[[Array32], Array32],
+    octave: int,
+    basis: _Basis,
+    frequencies: Array,
+) -> Lattice | None:
+    """Return equal places in all cells, by the phases of the two lowest clear frequencies that are independent."""
+    clear = frequencies[:_CLEAREST]
+    order = np.argsort(np.linalg.norm(clear, axis=1), kind="stable")
+    first, *others = (int(k) for k in order if np.any(basis.multiples[k]))
+    pair = next(
+        ([first, k] for k in others if round(np.linalg.det(basis.multiples[[first, k]]))), None
+    )
+    if pair is None:
+        return None
+    highest = float(np.linalg.norm(frequencies[pair], axis=1).max())
+    # The coarsest scale that resolves both is as good as any for the phases, and costs least.
+    further = max(0, int(np.log2(1.0 / highest / (1.6 * LEAST_PERIOD_PX))))
+    image = prepare(level(octave + further))
+    scale = 2.0**further
+    one, two = (follow_phase(image, scale * frequencies[k]) for k in pair)
+    if one is None or two is None:
+        return None
+    from_phases = np.linalg.inv(basis.multiples[pair]) / (2.0 * np.pi)
+    axes = np.linalg.inv(scale * basis.frequencies).T
+    if np.linalg.det(axes) < 0.0:
+        axes, from_phases = axes[::-1], from_phases[::-1]
+
+    def cell_of(xy: Array) -> Array:
+        return np.stack([one.at(xy), two.at(xy)], axis=1) @ from_phases.T
+
+    height, width = image.shape
+    middle = 0.5 * np.array([width - 1, height - 1])
+    reach = int(np.ceil(np.hypot(width, height) / np.linalg.svd(axes, compute_uv=False)[1]))
+    i, j = (g.ravel() for g in np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"))
+    ij = np.stack([i, j], axis=1).astype(np.intp)
+    xy = middle + ij @ axes
+    around = np.all((xy > -0.2 * middle) & (xy < 2.2 * middle), axis=1)
+    ij, xy = ij[around], xy[around]
+    start = np.rint(cell_of(middle[None]))
+    for _ in range(_STEPS):
+        xy = xy - np.clip(cell_of(xy) - start - ij, -2.0, 2.0) @ axes
+    inside: Mask = np.all((xy >= 0.0) & (xy <= [width - 1, height - 1]), axis=1)
+    inside &= np.all(np.abs(cell_of(xy) - start - ij) < 0.1, axis=1)
+    at = np.rint(xy[inside]).astype(np.intp)
+    seen = one.seen & two.seen
+    kept = np.flatnonzero(inside)[seen[at[:, 1], at[:, 0]]]
+    if not len(kept):
+        return None
+    factor = 2.0 ** (octave + further)
+    spread = np.broadcast_to(axes, (len(kept), 2, 2)).copy()
+    return Lattice(ij[kept], enlarged(xy[kept], factor), factor * spread)

@@ -1,0 +1,166 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The local phase of a picture at one spatial frequency, which says how far each place is from the next line.
+
+The picture is demodulated (Takeda et al. 1982, doi:10.1364/JOSA.72.000156). The phase is followed from period to period
+by its derivatives, which never wrap where a distortion bends the lines by less than half a period per period.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from semcal_ros.core.arrays import Array, Array32, Mask
+
+__all__ = ["LocalPhase", "SmoothPhase", "follow_phase"]
+
+# Standard deviation of the low pass behind the demodulation, in periods: harmonics are down to 4e-5.
+_SMOOTH = 0.75
+# Degree of the smooth part of the phase. The rest is added to it.
+_DEGREE = 5
+_POWERS = [(a, n - a) for n in range(1, _DEGREE + 1) for a in range(n + 1)]
+# Part of the median amplitude below which there are no lines, such as under debris or beyond the end of the grating.
+_FAINT = 0.3
+# Residual phase beyond which lines were not followed, rad: half a period is pi.
+_LOST = 2.0
+
+
+@dataclass(frozen=True)
+class SmoothPhase:
+    """A polynomial in x and y about the middle of a picture, rad.
+
+    Attributes
+    ----------
+    middle, scale
+        (2,) what is zero, and what is 1, px.
+    coefficients
+        Of the terms without a constant.
+    """
+
+    middle: Array
+    scale: float
+    coefficients: Array
+
+    def basis(self, x: Array, y: Array) -> Array:
+        """Return the terms at positions, along a last axis."""
+        u, v = (x - self.middle[0]) / self.scale, (y - self.middle[1]) / self.scale
+        return np.stack([u**a * v**b for a, b in _POWERS], axis=-1)
+
+    def at(self, x: Array, y: Array) -> Array:
+        """Return the phase at positions."""
+        return np.asarray(self.basis(x, y) @ self.coefficients)
+
+    def of_pixels(self, width: int, height: int) -> Array:
+        """Return the (height, width) phase of all pixels."""
+        u = (np.arange(width) - self.middle[0]) / self.scale
+        v = (np.arange(height) - self.middle[1]) / self.scale
+        matrix = np.zeros((_DEGREE + 1, _DEGREE + 1))
+        for (a, b), value in zip(_POWERS, self.coefficients, strict=True):
+            matrix[b, a] = value
+        return np.asarray(
+            np.vander(v, _DEGREE + 1, True) @ matrix @ np.vander(u, _DEGREE + 1, True).T
+        )
+
+
+@dataclass(frozen=True)
+class LocalPhase:
+    """The phase at all places of a picture.
+
+    Attributes
+    ----------
+    rate
+        (2,) phase per pixel along x and y that was taken off before.
+    smooth
+        A polynomial that follows most of the rest.
+    rest
+        (h, w) what is left, rad.
+    seen
+        (h, w) where the frequency is strong enough.
+    """
+
+    rate: Array
+    smooth: SmoothPhase
+    rest: Array
+    seen: Mask
+
+    def at(self, xy: Array) -> Array:
+        """Return the phase at (n, 2) positions, rad; it grows by a turn from line to line."""
+        x, y = xy.T
+        rest = ndimage.map_coordinates(self.rest, [y, x], order=1, mode="nearest")
+        return np.asarray(self.rate[0] * x + self.rate[1] * y + self.smooth.at(x, y) + rest)
+
+
+def follow_phase(image: Array32, frequency: Array) -> LocalPhase | None:
+    """Follow the phase at a frequency, in cycles per pixel, across a picture; None where that fails."""
+    height, width = image.shape
+    period = float(1.0 / np.linalg.norm(frequency))
+    amplitude, rate, values = _demodulate(image, frequency, _SMOOTH * period)
+    smooth = _fit_phase(amplitude, values, period)
+    turned = values * np.exp(-1j * smooth.of_pixels(width, height))
+    constant = float(np.angle(np.sum(turned * amplitude**2)))
+    left = np.angle(turned * np.exp(-1j * constant))
+    seen = amplitude > _FAINT * float(np.median(amplitude))
+    if float(np.mean(np.abs(left[seen]) > _LOST)) > 0.1:
+        return None
+    return LocalPhase(rate, smooth, left + constant, seen)
+
+
+def _demodulate(image: Array32, frequency: Array, sigma: float) -> tuple[Array, Array, Array]:
+    """Return the (h, w) amplitude, the (2,) phase per pixel that was taken off, and the (h, w) rest as unit phasors."""
+    height, width = image.shape
+    rate = 2.0 * np.pi * frequency
+    level = cv2.GaussianBlur(image, (0, 0), sigma)
+    wave = np.outer(
+        np.exp(-1j * rate[1] * np.arange(height)), np.exp(-1j * rate[0] * np.arange(width))
+    )
+    mixed = (image - level) * wave
+    real, imaginary = (
+        cv2.GaussianBlur(np.ascontiguousarray(part, dtype=np.float32), (0, 0), sigma)
+        for part in (mixed.real, mixed.imag)
+    )
+    values = real.astype(np.float64) + 1j * imaginary
+    amplitude = np.abs(values)
+    return amplitude, rate, values / np.maximum(amplitude, 1e-30)
+
+
+def _fit_phase(amplitude: Array, values: Array, period: float) -> SmoothPhase:
+    """Fit a polynomial without a constant to the phase of phasors, by the differences of neighbours."""
+    height, width = amplitude.shape
+    step = max(1, round(period))
+    fitted = SmoothPhase(
+        0.5 * np.array([width - 1, height - 1]), 0.5 * max(width, height), np.zeros(0)
+    )
+    grid = values[::step, ::step]
+    weight = amplitude[::step, ::step]
+    rows, columns = np.mgrid[0:height:step, 0:width:step].astype(np.float64)
+    terms = fitted.basis(columns, rows)
+    design, target, weights = [], [], []
+    for axis in (0, 1):
+        first = [slice(None)] * 2
+        second = [slice(None)] * 2
+        first[axis], second[axis] = slice(None, -1), slice(1, None)
+        a, b = tuple(first), tuple(second)
+        target.append(np.angle(grid[b] * np.conj(grid[a])).ravel())
+        weights.append(np.minimum(weight[a], weight[b]).ravel())
+        design.append((terms[b] - terms[a]).reshape(-1, len(_POWERS)))
+    matrix, right, certain = (np.concatenate(parts) for parts in (design, target, weights))
+    normal = matrix.T @ (matrix * certain[:, None])
+    # The ridge is for pictures of few periods, which do not determine all terms.
+    normal += 1e-6 * float(np.trace(normal)) / len(_POWERS) * np.eye(len(_POWERS))
+    return replace(fitted, coefficients=np.linalg.solve(normal, matrix.T @ (right * certain)))
