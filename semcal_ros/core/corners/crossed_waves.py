@@ -92,8 +92,10 @@ def find_cells(level: Callable[[int], Array32], size: tuple[int, int]) -> Lattic
         basis = _find_basis(frequencies, np.array(spectra[0].transform.shape[::-1]))
         if basis is None:
             continue
-        for prepare in _PREPARED:
-            cells = _follow(level, prepare, octave, basis, frequencies.values)
+        for prepare, clearness in zip(_PREPARED, frequencies.clearness, strict=True):
+            clear = np.argsort(-clearness, kind="stable")[:_CLEAREST]
+            clear = clear[clearness[clear] > _CLEAR]
+            cells = _follow(level, prepare, octave, basis, frequencies.values, clear)
             if cells is not None:
                 return cells
     return None
@@ -101,27 +103,31 @@ def find_cells(level: Callable[[int], Array32], size: tuple[int, int]) -> Lattic
 
 @dataclass(frozen=True)
 class _Frequencies:
-    """Frequencies (n, 2), cycles per pixel, the clearest first, and the roots (n,) of their clearness."""
+    """Frequencies (n, 2), cycles per pixel, and how clear they are in each of the prepared images (p, n)."""
 
     values: Array
-    roots: Array
+    clearness: Array
 
 
 def _list_frequencies(spectra: list[Spectrum]) -> _Frequencies:
-    """Return the frequencies of an image with all grey levels and with clipped ones."""
-    found: list[tuple[float, Array]] = []
+    """Return the frequencies of an image with all grey levels and with clipped ones, the clearest first."""
     size = np.array(spectra[0].transform.shape[::-1])
+    found = []
     for spectrum in spectra:
         radius = np.hypot(spectrum.fx, spectrum.fy)
-        among = radius > LEAST_PERIODS / min(spectrum.transform.shape)
+        among = radius > LEAST_PERIODS / size.min()
         among &= (radius < 1.0 / LEAST_PERIOD_PX) & (spectrum.clearness > _CLEAR)
-        for own in spectrum.find_frequencies(among, _MOST):
-            clear = float(spectrum.clearness[spectrum.bins_from(own) < 2.0].max(initial=_CLEAR))
-            found.append((clear, own))
-    found.sort(key=lambda entry: entry[0], reverse=True)
-    values = np.array([own for _, own in found]).reshape(-1, 2)
-    kept = _find_distinct(values, size, len(values))
-    return _Frequencies(values[kept], np.sqrt([found[k][0] for k in kept]))
+        found.append(spectrum.find_frequencies(among, _MOST))
+    values = np.concatenate(found)
+    clearness = np.array([[_clearness_at(s, f) for f in values] for s in spectra])
+    order = np.argsort(-clearness.max(axis=0), kind="stable") if len(values) else np.arange(0)
+    kept = order[_find_distinct(values[order], size, len(values))]
+    return _Frequencies(values[kept], clearness[:, kept])
+
+
+def _clearness_at(spectrum: Spectrum, frequency: Array) -> float:
+    near = spectrum.bins_from(frequency) < 2.0 * _OFF
+    return float(spectrum.clearness[near].max(initial=0.0))
 
 
 def _find_distinct(frequencies: Array, size: Array, most: int) -> list[int]:
@@ -139,9 +145,10 @@ def _find_distinct(frequencies: Array, size: Array, most: int) -> list[int]:
 
 def _find_basis(frequencies: _Frequencies, size: Array) -> _Basis | None:
     """Return the widest two frequencies that the others are multiples of; ``size`` is (width, height)."""
-    values, roots = frequencies.values, frequencies.roots
+    values = frequencies.values
     if len(values) < 2:
         return None
+    roots = np.sqrt(frequencies.clearness.max(axis=0))
     pairs = [a + sign * b for a, b in combinations(values, 2) for sign in (1.0, -1.0)]
     parts = [values / n for n in range(1, _PARTS + 1)]
     tried = np.concatenate([*parts, np.array(pairs)])
@@ -195,13 +202,13 @@ def _follow(
     octave: int,
     basis: _Basis,
     frequencies: Array,
+    clear: Indices,
 ) -> Lattice | None:
     """Return equal places in all cells, by the phases of the two lowest clear frequencies that are independent."""
-    clear = frequencies[:_CLEAREST]
-    order = np.argsort(np.linalg.norm(clear, axis=1), kind="stable")
-    first, *others = (int(k) for k in order if np.any(basis.multiples[k]))
+    order = clear[np.argsort(np.linalg.norm(frequencies[clear], axis=1), kind="stable")]
+    known = [int(k) for k in order if np.any(basis.multiples[k])]
     pair = next(
-        ([first, k] for k in others if round(np.linalg.det(basis.multiples[[first, k]]))), None
+        ([known[0], k] for k in known if round(np.linalg.det(basis.multiples[[known[0], k]]))), None
     )
     if pair is None:
         return None
@@ -210,7 +217,8 @@ def _follow(
     further = max(0, int(np.log2(1.0 / highest / (1.6 * LEAST_PERIOD_PX))))
     image = prepare(level(octave + further))
     scale = 2.0**further
-    one, two = (follow_phase(image, scale * frequencies[k]) for k in pair)
+    period = 1.0 / float(np.linalg.norm(scale * basis.frequencies, axis=1).min())
+    one, two = (follow_phase(image, scale * frequencies[k], period) for k in pair)
     if one is None or two is None:
         return None
     from_phases = np.linalg.inv(basis.multiples[pair]) / (2.0 * np.pi)

@@ -106,7 +106,6 @@ _CELL_FULL_PX = 80.0
 # Least distance of points in a reduced picture, px.
 _SPACING_MIN_PX = 10.0
 
-_NOT_SQUARE = Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")
 _POINTS = {
     "chess": "corners",
     "dots": "dots",
@@ -242,7 +241,7 @@ def find_lattice(
     crossed = _find_crossed(pyramid, 0.0 if shown is None else _POWER_MIN * shown.power)
     if crossed is not None:
         if best is not None and _repeats_with(best, crossed):
-            return best if best.pattern == "chess" or _is_square(crossed) else _NOT_SQUARE
+            return best
         # Of a chess board, the corners are elsewhere.
         if wanted not in ("auto", "chess") or not _is_likely_chess(crossed):
             own = _measure_likely(pyramid, crossed, wanted)
@@ -440,14 +439,6 @@ def _is_likely_chess(candidate: _Candidate) -> bool:
     return candidate.shapes is not None and candidate.shapes.best.pattern == "chess"
 
 
-def _is_square(candidate: _Candidate) -> bool:
-    """Whether the cells look as those of a square lattice do, or may be those of a chess board."""
-    shapes = candidate.shapes
-    assert shapes is not None
-    may_be_chess = shapes.allows("chess") and not candidate.is_mixture
-    return shapes.asymmetry <= _ASYMMETRY_MAX or may_be_chess
-
-
 def _likely_shapes(
     candidate: _Candidate, wanted: PatternChoice
 ) -> list[CellShape | Rejection[LatticeStatus]]:
@@ -456,8 +447,10 @@ def _likely_shapes(
     if shapes is None:
         # Of the few squares of a small board, none may be in view as a whole.
         return [CellShape("chess", True, 1.0, 0.0, 0.0)] if wanted in ("auto", "chess") else []
-    if not _is_square(candidate):
-        return [_NOT_SQUARE]
+    # Of a chess board, the corners are elsewhere than the cells of a mixture.
+    may_be_chess = shapes.allows("chess") and not candidate.is_mixture
+    if shapes.asymmetry > _ASYMMETRY_MAX and not may_be_chess:
+        return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
     if wanted == "auto":
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
         if candidate.is_mixture:

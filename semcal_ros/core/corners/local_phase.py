@@ -32,6 +32,8 @@ __all__ = ["LocalPhase", "SmoothPhase", "follow_phase"]
 
 # Standard deviation of the low pass behind the demodulation, in periods: harmonics are down to 4e-5.
 _SMOOTH = 0.75
+# The same in periods of a pattern, whose other frequencies are as far as its own from a multiple: down to 2 %.
+_APART = 0.45
 # Degree of the smooth part of the phase. The rest is added to it.
 _DEGREE = 5
 _POWERS = [(a, n - a) for n in range(1, _DEGREE + 1) for a in range(n + 1)]
@@ -106,11 +108,25 @@ class LocalPhase:
         return np.asarray(self.rate[0] * x + self.rate[1] * y + self.smooth.at(x, y) + rest)
 
 
-def follow_phase(image: Array32, frequency: Array) -> LocalPhase | None:
-    """Follow the phase at a frequency, in cycles per pixel, across a picture; None where that fails."""
+def follow_phase(
+    image: Array32, frequency: Array, period_px: float | None = None
+) -> LocalPhase | None:
+    """Follow the phase at a frequency across a picture; None where that fails.
+
+    Parameters
+    ----------
+    image
+        (h, w).
+    frequency
+        (2,) cycles per pixel.
+    period_px
+        Period of the pattern, of which the frequency is a multiple; the frequency's own by default.
+    """
     height, width = image.shape
     period = float(1.0 / np.linalg.norm(frequency))
-    amplitude, rate, values = _demodulate(image, frequency, _SMOOTH * period)
+    amplitude, rate, values = _demodulate(
+        image, frequency, max(_SMOOTH * period, _APART * (period_px or 0.0))
+    )
     smooth = _fit_phase(amplitude, values, period)
     turned = values * np.exp(-1j * smooth.of_pixels(width, height))
     constant = float(np.angle(np.sum(turned * amplitude**2)))
