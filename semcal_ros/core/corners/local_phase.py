@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polygrid2d, polyval2d
 from scipy import ndimage
 
 from semcal_ros.core.arrays import Array, Array32, Mask
@@ -37,6 +38,8 @@ _APART = 0.45
 # Degree of the smooth part of the phase. The rest is added to it.
 _DEGREE = 5
 _POWERS = [(a, n - a) for n in range(1, _DEGREE + 1) for a in range(n + 1)]
+# Places across a picture at which the phase is compared with the next, at most.
+_FINEST = 128
 # Part of the median amplitude below which there are no lines, such as under debris or beyond the end of the grating.
 _FAINT = 0.3
 # Residual phase beyond which lines were not followed, rad: half a period is pi.
@@ -61,23 +64,27 @@ class SmoothPhase:
 
     def basis(self, x: Array, y: Array) -> Array:
         """Return the terms at positions, along a last axis."""
-        u, v = (x - self.middle[0]) / self.scale, (y - self.middle[1]) / self.scale
+        u, v = self._scaled(x, y)
         return np.stack([u**a * v**b for a, b in _POWERS], axis=-1)
 
     def at(self, x: Array, y: Array) -> Array:
         """Return the phase at positions."""
-        return np.asarray(self.basis(x, y) @ self.coefficients)
+        return np.asarray(polyval2d(*self._scaled(x, y), self._matrix))
 
     def of_pixels(self, width: int, height: int) -> Array:
         """Return the (height, width) phase of all pixels."""
-        u = (np.arange(width) - self.middle[0]) / self.scale
-        v = (np.arange(height) - self.middle[1]) / self.scale
+        u, v = self._scaled(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        return np.asarray(polygrid2d(u, v, self._matrix).T)
+
+    def _scaled(self, x: Array, y: Array) -> tuple[Array, Array]:
+        return (x - self.middle[0]) / self.scale, (y - self.middle[1]) / self.scale
+
+    @property
+    def _matrix(self) -> Array:
+        """Coefficients of u^a v^b at [a, b]."""
         matrix = np.zeros((_DEGREE + 1, _DEGREE + 1))
-        for (a, b), value in zip(_POWERS, self.coefficients, strict=True):
-            matrix[b, a] = value
-        return np.asarray(
-            np.vander(v, _DEGREE + 1, True) @ matrix @ np.vander(u, _DEGREE + 1, True).T
-        )
+        matrix[tuple(np.transpose(_POWERS))] = self.coefficients
+        return matrix
 
 
 @dataclass(frozen=True)
@@ -158,7 +165,8 @@ def _demodulate(image: Array32, frequency: Array, sigma: float) -> tuple[Array, 
 def _fit_phase(amplitude: Array, values: Array, period: float) -> SmoothPhase:
     """Fit a polynomial without a constant to the phase of phasors, by the differences of neighbours."""
     height, width = amplitude.shape
-    step = max(1, round(period))
+    # Fine enough for a bend of a quarter of a period per period, if 1000 px wide.
+    step = max(1, round(period), min(height, width) // _FINEST)
     fitted = SmoothPhase(
         0.5 * np.array([width - 1, height - 1]), 0.5 * max(width, height), np.zeros(0)
     )

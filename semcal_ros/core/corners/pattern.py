@@ -95,6 +95,9 @@ SOME = 7
 # By how much a relief has to lower what is left of the power: noise does so once in 10 000 cells, by its four numbers
 # among 56 (F test).
 RELIEF_GAIN = 1.6
+# The most that a relief may leave: replicas with bright edges leave up to 0.23, and pads half as wide as their
+# distance, seen about the middle between two of them, 0.34.
+RELIEF_MOST = 0.25
 # Least part of the power that is at no multiples of one frequency: parallel lines, which the derivative of any shape
 # explains, have 0.005, and crossed ones of which one direction is hardly seen 0.05.
 RELIEF_ASIDE = 0.03
@@ -348,8 +351,9 @@ def fit_shapes(cell: UnitCell) -> CellShapes:
     left = 1.0 - projected / even
     slopes = np.zeros(2)
     shaded = _fit_relief(seen)
-    better = RELIEF_GAIN * float(shaded.left.min()) < 1.0 - float(projected.max()) / power
-    if better and _measure_aside(seen) > RELIEF_ASIDE:
+    least = float(shaded.left.min())
+    better = RELIEF_GAIN * least < 1.0 - float(projected.max()) / power
+    if better and least < RELIEF_MOST and _measure_aside(seen) > RELIEF_ASIDE:
         left, slopes, even = shaded.left, shaded.slopes, power
         seen = seen * _move(*shaded.centre)
         mirrored = mirrored * np.exp(2j * np.pi * (h * shaded.centre[0] - k * shaded.centre[1]))
