@@ -166,6 +166,7 @@ def test_nothing_is_done_with_two_streams_on_one_topic(session: Session) -> None
     assert session.call("add_view").success
 
 
+@pytest.mark.long
 def test_views_are_calibrated_while_other_nodes_go_on(session: Session, tmp_path: Path) -> None:
     assert session.call("clear").success
     # Degrees that pass for radians, until one does not.

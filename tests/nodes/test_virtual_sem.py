@@ -186,9 +186,8 @@ def _change(first: Any, last: Any, margin_px: int) -> float:
     return float(np.std(pixels(first)[inner].astype(float) - pixels(last)[inner]))
 
 
-@pytest.mark.parametrize(
-    "tracking", ["every_frame", pytest.param("forecast", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("tracking", ["every_frame", "forecast"])
 def test_a_moving_stage_is_seen_as_drift_and_compensated(peer: Peer, tracking: str) -> None:
     """The stage moves at a known speed; the compensator finds that drift and holds the image."""
     speed_px_s = np.array([6.0, -3.0])

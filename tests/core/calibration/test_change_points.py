@@ -54,6 +54,7 @@ def _calibrated(magnifications=CALIBRATED, views=4, **options):
     )
 
 
+@pytest.mark.long
 def test_a_jump_is_suspected_and_said_but_not_applied():
     result = _calibrated()
     (warning,) = [w for w in result.warnings if "jump" in w]

@@ -45,13 +45,13 @@ def _misnamed(views, index, factor):
 
 
 # Under a parallel projection, tilts of a stretched grid imitate the wrong scale; of the last view best of all.
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "factor", "wrong"),
     [
         ("strong_perspective", 1.06, 10),
-        pytest.param("parallel", 0.94, 10, marks=pytest.mark.long),
-        pytest.param("parallel", 1.06, 11, marks=pytest.mark.long),
+        ("parallel", 0.94, 10),
+        ("parallel", 1.06, 11),
     ],
 )
 def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):
