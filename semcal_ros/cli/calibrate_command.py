@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -199,13 +200,18 @@ def _echo_result(done: RecordingCalibration) -> None:
     )
     if statistics["held_out_rms_px"] is not None:
         click.echo("held out: calibrated without that magnification; * is extrapolated")
-    patterns = sorted({PATTERN_NAMES[view.detection.pattern] for view in done.collected.found})
+    patterns = Counter(PATTERN_NAMES[view.detection.pattern] for view in done.collected.found)
     odds = [view.detection.odds for view in done.collected.found if view.detection.odds > 0.0]
     if patterns:
         least = f", by odds of {describe_odds(min(odds))}" if odds else ""
         if odds and min(odds) < 1.0:
             least = f", although another kind fits better in places, by odds of {describe_odds(1.0 / min(odds))}"
-        click.echo(f"the grid: {' and '.join(patterns)}{least}")
+        (pattern, _), *others = patterns.most_common()
+        taken = "".join(
+            f"; in {counted(number, 'view')} taken for {other}, with the same points"
+            for other, number in others
+        )
+        click.echo(f"the grid: {pattern}{least}{taken}")
     click.echo(
         f"{statistics['views']} of {counted(total, 'view')}, {counted(statistics['corners'], 'corner')}, "
         f"method {method}: RMS {statistics['rms_px']:.4f} px"

@@ -69,6 +69,8 @@ _MUCH_LONGER, _AS_LONG = 3.0, 0.5
 _TOO_FEW_TO_SHARE = 12
 # Reasons that a message about refused views gives.
 _MOST_REASONS = 4
+# Patterns that have their points in the middle of their cells.
+_CELLS = {"dots", "crosses", "lines"}
 # Frames that this process takes itself where a grid can end the search, before it starts others that would not end
 # with it.
 _FIRST_HERE = 4
@@ -273,8 +275,10 @@ def collect_views(
             if other_pattern
             else "check focus, contrast, and that the grid fills the image",
         )
-    # A recording shows one grid. A view in which another pattern was seen was misread.
+    # A recording shows one grid. A view in which another pattern was seen was misread; but whether cells are called
+    # dots, crosses or crossed lines does not move their points, which are the same place in all cells.
     pattern = Counter(v.detection.pattern for v in found).most_common(1)[0][0]
+    alike = _CELLS if pattern in _CELLS else {pattern}
     misread = [
         RejectedView(
             v.name,
@@ -286,9 +290,9 @@ def collect_views(
             v.image,
         )
         for v in found
-        if v.detection.pattern != pattern
+        if v.detection.pattern not in alike
     ]
-    found = [v for v in found if v.detection.pattern == pattern]
+    found = [v for v in found if v.detection.pattern in alike]
     sizes = Counter(v.detection.image_size for v in found)
     image_size = sizes.most_common(1)[0][0]
     same = [v for v in found if v.detection.image_size == image_size]

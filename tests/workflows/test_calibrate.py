@@ -106,6 +106,21 @@ def test_no_grid_at_all_is_refused_with_the_commonest_reason():
         calibrate([(blank, 1000.0)] * 3)
 
 
+def test_what_cells_are_called_does_not_cost_a_view():
+    rng = np.random.default_rng(0)
+    turned = [
+        PatternBoard(20.0, turn_deg=turn, noise=4.0).picture(rng) for turn in (5.0, 25.0, 50.0)
+    ]
+    found, rejected = find_views(
+        [(f"{i}", image, 1000.0) for i, image in enumerate(turned)], processes=1
+    )
+    other = replace(found[1], detection=replace(found[1].detection, pattern="crosses"))
+    views = [found[0], other, found[2]]
+    collected = collect_views(views, rejected, display_width_m=0.12, squares_m=[1e-5])
+    assert [v.name for v in collected.found] == ["0", "1", "2"]
+    assert collected.rejected == ()
+
+
 def test_the_pattern_of_most_views_is_that_of_the_grid():
     rng = np.random.default_rng(0)
     turned = [PatternBoard(20.0, turn_deg=turn, noise=4.0).picture(rng) for turn in (5.0, 25.0)]
