@@ -223,31 +223,31 @@ def find_lattice(
     pyramid = _Pyramid(scaled)
     if wanted == "grating":
         return _find_grating(pyramid)
+    candidates = _rank(list(_search(pyramid)))
+    # Where saddle points show no clear pattern, its frequencies tell the lattice.
+    crossed = None if any(c.is_clear for c in candidates) else _find_crossed(pyramid)
     answer: Rejection[LatticeStatus] | None = None
     best: LatticeDetection | None = None
-    shown: CellShapes | None = None
-    for candidate in _rank(list(_search(pyramid))):
+    is_clear = False
+    for candidate in candidates:
+        if crossed is not None and not _may_be(candidate, crossed):
+            continue
         own = _measure_likely(pyramid, candidate, wanted)
         if isinstance(own, Rejection):
             # What is said is said of the candidate that covers most of the image.
             answer = answer or own
         elif own is not None and (best is None or _filled_by(own) > _filled_by(best)):
-            best, shown = own, candidate.shapes
+            best, is_clear = own, candidate.is_clear
         if best is not None and candidate.filled > 0.5 * _FILLED:
             break
-    if best is not None and shown is not None and shown.best.misfit < _CLEAR_MISFIT:
+    if best is not None and (is_clear or crossed is not None):
         return best
-    # Where saddle points show no clear pattern, its frequencies tell the lattice.
-    crossed = _find_crossed(pyramid, 0.0 if shown is None else _POWER_MIN * shown.power)
-    if crossed is not None:
-        if best is not None and _repeats_with(best, crossed):
-            return best
-        # Of a chess board, the corners are elsewhere.
-        if wanted not in ("auto", "chess") or not _is_likely_chess(crossed):
-            own = _measure_likely(pyramid, crossed, wanted)
-            if isinstance(own, LatticeDetection):
-                return own
-            answer = answer or own
+    # Of a chess board, the corners are elsewhere than its cells.
+    if crossed is not None and (wanted not in ("auto", "chess") or not crossed.is_likely_chess):
+        own = _measure_likely(pyramid, crossed, wanted)
+        if isinstance(own, LatticeDetection):
+            return own
+        answer = answer or own
     # Noise between parallel lines makes lattices too.
     if wanted == "auto" and isinstance(find_lines(pyramid.level, pyramid.size), Lattice):
         return Rejection(
@@ -276,33 +276,32 @@ def _measure_likely(
     return best or answer
 
 
-def _find_crossed(pyramid: _Pyramid, least_power: float) -> _Candidate | None:
-    """Return the cells of a pattern that repeats in two directions.
-
-    Parts of cells that are not alike have less than the least power.
-    """
+def _find_crossed(pyramid: _Pyramid) -> _Candidate | None:
+    """Return the cells of a pattern that repeats in two directions, by its frequencies."""
     places = find_cells(pyramid.level, pyramid.size)
     if places is None or len(places.ij) < _LEAST_GROWN:
         return None
     cells = centre_cells(pyramid.level, places)
     shapes = fit_lattice_shapes(pyramid.level, cells)
-    if shapes is None or shapes.power < least_power:
+    if shapes is None:
         return None
     filled = float(np.abs(np.linalg.det(cells.axes)).sum()) / (pyramid.size[0] * pyramid.size[1])
     return _Candidate(cells, cells, shapes, filled, filled, True)
 
 
-def _repeats_with(points: LatticeDetection, candidate: _Candidate) -> bool:
-    """Whether points are as dense as the cells of a candidate; of a chess board, two squares are a cell."""
-    width, height = points.image_size
-    middle = np.linalg.norm(points.xy - 0.5 * np.array([width, height]), axis=1)
-    nearest = np.argsort(middle)[:MINIMUM_CORNERS]
-    maps = fit_local_maps(points.ij[nearest], points.ij, points.xy, leave_out_self=False)
-    cell = float(np.median(np.abs(np.linalg.det(maps.axes))))
-    if points.pattern == "chess":
-        cell *= 2.0
-    other = float(np.median(np.abs(np.linalg.det(candidate.corners.axes))))
-    return abs(np.log(cell / other)) < _SAME_AREA
+def _may_be(candidate: _Candidate, crossed: _Candidate) -> bool:
+    """Whether the cells of a candidate may be those that the frequencies tell.
+
+    They are as large, or the latter are but parts of cells, which average to less where they are not alike.
+    """
+    if candidate.cells is None or candidate.shapes is None or crossed.shapes is None:
+        return True
+    own, other = (
+        float(np.median(np.abs(np.linalg.det(cells.axes))))
+        for cells in (candidate.cells, crossed.corners)
+    )
+    are_parts = crossed.shapes.power < _POWER_MIN * candidate.shapes.power
+    return are_parts or abs(np.log(own / other)) < _SAME_AREA
 
 
 def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStatus]:
@@ -396,6 +395,11 @@ class _Candidate:
         """Whether it shows its pattern."""
         return self.shapes is not None and self.shapes.best.misfit < _CLEAR_MISFIT
 
+    @property
+    def is_likely_chess(self) -> bool:
+        """Whether its cells are most likely those of a chess board."""
+        return self.shapes is not None and self.shapes.best.pattern == "chess"
+
 
 def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
     """Find lattices scale by scale; a clear chess board that fills the image ends the search."""
@@ -433,10 +437,6 @@ def _rank(found: list[_Candidate]) -> list[_Candidate]:
         and (c.shapes is None or c.shapes.power >= _POWER_MIN * strongest)
     ]
     return sorted(kept, key=lambda c: c.regular, reverse=True)[:_LATTICES_TRIED]
-
-
-def _is_likely_chess(candidate: _Candidate) -> bool:
-    return candidate.shapes is not None and candidate.shapes.best.pattern == "chess"
 
 
 def _likely_shapes(
