@@ -33,10 +33,10 @@ from semcal_ros.core.corners.local_phase import follow_phase
 from semcal_ros.core.corners.spectrum import (
     LEAST_PERIOD_PX,
     LEAST_PERIODS,
-    PART_PX,
     Spectrum,
     clip_levels,
     compute_spectrum,
+    list_octaves,
 )
 
 __all__ = ["find_cells"]
@@ -85,8 +85,7 @@ def find_cells(level: Callable[[int], Array32], size: tuple[int, int]) -> Lattic
     The lattice of equal places in its cells, of which it does not say which they are. Places are good to a tenth of
     the period.
     """
-    octaves = range(max(0, int(np.ceil(np.log2(max(size) / PART_PX)))) + 1)
-    for octave in octaves:
+    for octave in list_octaves(size):
         spectra = [compute_spectrum(prepare(level(octave))) for prepare in _PREPARED]
         frequencies = _list_frequencies(spectra)
         basis = _find_basis(frequencies, np.array(spectra[0].transform.shape[::-1]))

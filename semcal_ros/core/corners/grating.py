@@ -32,9 +32,9 @@ from semcal_ros.core.corners.saddle import LatticeStatus
 from semcal_ros.core.corners.spectrum import (
     LEAST_PERIOD_PX,
     LEAST_PERIODS,
-    PART_PX,
     clip_levels,
     compute_spectrum,
+    list_octaves,
 )
 from semcal_ros.core.errors import Rejection
 
@@ -105,8 +105,7 @@ def find_lines(
     A lattice whose ``i`` counts lines and whose ``j`` counts places along them, good to a tenth of the period, or why
     there is none: no frequency stands out, or lines or points repeat in another direction too.
     """
-    octaves = range(max(0, int(np.ceil(np.log2(max(size) / PART_PX)))) + 1)
-    waves = [_find_clearest_wave(level(octave), octave) for octave in octaves]
+    waves = [_find_clearest_wave(level(octave), octave) for octave in list_octaves(size)]
     found = [wave for wave in waves if wave is not None and wave.power > _PEAK]
     if not found:
         return Rejection(

@@ -32,14 +32,14 @@ from semcal_ros.core.arrays import Array, Array32, Image, Mask
 __all__ = [
     "LEAST_PERIODS",
     "LEAST_PERIOD_PX",
-    "PART_PX",
     "Spectrum",
     "clip_levels",
     "compute_spectrum",
+    "list_octaves",
 ]
 
-#: Side of the part of the picture, at each of its scales, in which the frequency is looked for, px.
-PART_PX = 1024
+# Side of the part of the picture, at each of its scales, in which the frequency is looked for, px.
+_PART_PX = 1024
 #: Periods that are looked for: at least so many in the part, and so many pixels long.
 LEAST_PERIODS, LEAST_PERIOD_PX = 3.5, 5.0
 # Power at a part of the frequency that makes it the frequency: over the same median, which chance exceeds
@@ -220,8 +220,8 @@ class Spectrum:
 
 
 def compute_spectrum(image: Image) -> Spectrum:
-    """Compute the spectrum of the middle of a (h, w) image, at most :data:`PART_PX` wide."""
-    height, width = (min(side, PART_PX) for side in image.shape)
+    """Compute the spectrum of the middle of a (h, w) image, at most 1024 px wide."""
+    height, width = (min(side, _PART_PX) for side in image.shape)
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
     part = image[top : top + height, left : left + width].astype(np.float64)
     window = np.outer(np.hanning(height), np.hanning(width))
@@ -230,6 +230,11 @@ def compute_spectrum(image: Image) -> Spectrum:
     power = np.abs(transform[:, : width // 2 + 1]) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
     return Spectrum(transform, power, power / _usual_power(power, np.hypot(fx, fy)), fx, fy)
+
+
+def list_octaves(size: tuple[int, int]) -> range:
+    """Return the scales of an image of this (width, height), down to the one that a spectrum shows as a whole."""
+    return range(max(0, int(np.ceil(np.log2(max(size) / _PART_PX)))) + 1)
 
 
 def clip_levels(image: Array32) -> Array32:
