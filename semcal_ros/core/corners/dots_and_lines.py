@@ -278,6 +278,8 @@ def refine_cells(image: Array32, cells: Lattice, shape: CellShape) -> RefinedCor
             return None
         known = _fit(image, known.cells, maps, cell, noise, iterations=2)
     last = known
+    if last.good.sum() < CORNERS_MIN:
+        return None
     keep = last.good & _undisturbed(last.fit, last.good)
     keep = find_consistent(last.cells, last.maps, last.fit, keep)
     if keep.sum() < CORNERS_MIN:

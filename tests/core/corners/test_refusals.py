@@ -158,3 +158,23 @@ def test_what_is_not_an_image_raises(image: NDArray[np.generic]) -> None:
         find_lattice(image)
     with pytest.raises(InvalidValueError, match="databar"):
         find_lattice(np.zeros((64, 64), np.uint8), databar_rows=60)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_small_pictures_of_any_pattern_raise_no_numerical_warning(seed: int) -> None:
+    """Found or refused; of a few of them no cell was left to compare the others with."""
+    rng = np.random.default_rng((seed, 7))
+    for _ in range(8):
+        height, width = rng.integers(90, 180, 2)
+        y, x = np.mgrid[0:height, 0:width]
+        pitch = int(rng.integers(13, 24))
+        waves = np.sin(2.0 * np.pi * x / pitch) * np.sin(2.0 * np.pi * y / pitch)
+        bars = (x % pitch < 3) | (y % pitch < 3)
+        for pattern in (60.0 * waves, 120.0 * bars):
+            picture = 90.0 + pattern + rng.normal(0.0, rng.choice([1.0, 20.0]), x.shape)
+            found = find_lattice(np.clip(picture, 0, 255).astype(np.uint8))
+            if isinstance(found, Rejection):
+                assert found.reason
+            else:
+                assert np.all(np.isfinite(found.xy))
+                assert np.all(found.sigma_px > 0.0)
