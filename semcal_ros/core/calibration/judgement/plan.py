@@ -379,15 +379,19 @@ class Verdict:
         """Return what to record next; empty if that is not known."""
         visit = self.next_visit
         if visit is not None:
-            what, how = "squares", "flat and tilted by"
-            angles = [t for t in PLANNED_TILTS_RAD if t > 0.0]
-            if self.is_grating:
-                what, how, angles = "lines", "untilted, turned to", list(PLANNED_DIRECTIONS_RAD)
+            angles = PLANNED_DIRECTIONS_RAD if self.is_grating else PLANNED_TILTS_RAD[1:]
             *first, last = [f"{math.degrees(angle):.0f}" for angle in angles]
+            degrees = f"{', '.join(first)} and {last} degrees"
+            size, where = 1e6 * visit.square_m, rounded_magnification(visit.magnification)
+            percent = 100.0 * visit.largest
+            if self.is_grating:
+                return (
+                    f"to improve it most: views of the {size:g} um lines at {where}, untilted, turned to {degrees}, "
+                    f"bring it to {percent:.2g} % (see semcal plan)"
+                )
             return (
-                f"to improve it most: views of the {1e6 * visit.square_m:g} um {what} at "
-                f"{rounded_magnification(visit.magnification)}, {how} {', '.join(first)} and {last} degrees, "
-                f"bring it to {100.0 * visit.largest:.2g} % (see semcal plan)"
+                f"to improve it most: views of the {size:g} um squares at {where}, flat and tilted by {degrees}, "
+                f"bring it to {percent:.2g} % (see semcal plan)"
             )
         if not math.isfinite(self.floor):
             return ""
