@@ -197,6 +197,7 @@ def test_a_stream_node_that_is_killed_again_and_again_comes_back(
 # -- parameter_server --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_killed_parameter_server_comes_back_with_camera_and_parameters(
     peer: Peer, calibration_file: Path
 ) -> None:

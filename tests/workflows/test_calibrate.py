@@ -176,6 +176,7 @@ def test_a_slightly_wrong_magnification_is_named_after_the_adjustment(found):
     assert len(done.result.views) == len(done.collected.found) == len(found[0]) - 1
 
 
+@pytest.mark.long
 def test_a_size_that_is_named_wrongly_is_recognised(found):
     """The views of a size that squares_m has not are left out, and told what they show."""
     shown = sorted({f.square_m for f in PLAN.frames})

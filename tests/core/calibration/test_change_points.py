@@ -79,6 +79,7 @@ def test_a_breakpoint_gives_the_scale_on_both_sides():
     assert model.at(3000.0).m / model.at(2999.999).m - 1.0 == pytest.approx(JUMP, abs=0.004)
 
 
+@pytest.mark.long
 def test_breakpoints_survive_the_file(tmp_path):
     few = (100.0, 1000.0, 2500.0, 4000.0, 6000.0, 8000.0, 10000.0)
     model = _calibrated(few, views=3, breakpoints=(3000.0, 7000.0)).model

@@ -70,7 +70,7 @@ def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["jsm820", "pincushion"])
+@pytest.mark.parametrize("name", ["jsm820", pytest.param("pincushion", marks=pytest.mark.long)])
 def test_ordinary_views_stay(name):
     """As they do with those of the other microscopes (test_calibrate, test_residual_field_fit)."""
     result = calibrated(name, OFF)

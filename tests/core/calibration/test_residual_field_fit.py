@@ -104,6 +104,7 @@ def test_terms_describe_coils_settling_and_spiral_without_a_field(microscope, te
     assert _model_error(result, microscope) < 0.03
 
 
+@pytest.mark.long
 def test_auto_finds_what_no_term_describes(with_field):
     without = _calibrate(WAVY, "off")
     assert without.model.residual is None

@@ -30,6 +30,7 @@ from semcal_ros.core.rectification.line_phase import (
     estimate_line_phase,
     remove_line_phase,
 )
+from tests.helpers.long_tests import long_but
 
 
 def shifted(image: AnyImage, phase_px: float) -> Array:
@@ -52,7 +53,7 @@ def noisy_scene(name: str) -> AnyImage:
 
 
 @pytest.mark.parametrize("name", ["gold", "fractal", "lattice", "scratches"])
-@pytest.mark.parametrize("phase_px", [-6.0, 0.3, 2.7])
+@pytest.mark.parametrize("phase_px", long_but(lambda phase: phase != 0.3, [-6.0, 0.3, 2.7]))
 def test_the_phase_is_right_within_its_sigma(name: str, phase_px: float) -> None:
     found = estimate_line_phase(shifted(noisy_scene(name), phase_px))
     assert found.sigma_px < 0.06
