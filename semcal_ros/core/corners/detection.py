@@ -189,10 +189,11 @@ def find_lattice(
     """Find a grid, in view as a whole or in part, at any rotation and tilt.
 
     Candidates are lattices through saddle points of the image at all scales, up to points a quarter of the picture
-    apart. Corners of a chess board are fitted by a model of two crossing blurred edges (see
-    :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance; dots, crosses and crossings of
-    lines by their mean cell (see :mod:`semcal_ros.core.corners.dots_and_lines`). Where edges are rough or blurred
-    over many pixels, that is done in a reduced picture.
+    apart; where none of them shows its pattern clearly, also the cells that its spatial frequencies tell (see
+    :mod:`semcal_ros.core.corners.crossed_waves`). Corners of a chess board are fitted by a model of two crossing
+    blurred edges (see :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance; dots, crosses
+    and crossings of lines by their mean cell (see :mod:`semcal_ros.core.corners.dots_and_lines`). Where edges are
+    rough or blurred over many pixels, that is done in a reduced picture.
 
     Parameters
     ----------
