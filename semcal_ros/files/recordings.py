@@ -750,8 +750,10 @@ class _ImageRecording(Recording):
     def pixel_size_stated(self) -> bool:
         if self._given.pixel_size_m is not None or self._given.magnification is not None:
             return self._given.pixel_size_m is not None
-        settings = (image.page.settings for image in self._series.images)
-        return all(own is not None and not own.display_width_assumed for own in settings)
+        # An OME-TIFF or a picture that ImageJ saved has a pixel size, but no settings of a microscope.
+        pages = [image.page for image in self._series.images]
+        assumed = (p.settings is not None and p.settings.display_width_assumed for p in pages)
+        return all(p.pixel_size_m is not None for p in pages) and not any(assumed)
 
     def _outlines(self, wanted: Container[int]) -> Iterator[FrameOutline]:
         chosen = {id(image) for k, image in enumerate(self._series.images) if k in wanted}

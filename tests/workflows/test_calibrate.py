@@ -33,6 +33,7 @@ from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
+from semcal_ros.files.images.write import PixelScale, write_image
 from semcal_ros.synthetic import Detector, calibration_plan, preset
 from semcal_ros.workflows import calibrate as workflow
 from semcal_ros.workflows.calibrate import calibrate_found, calibrate_recording, options_for
@@ -104,6 +105,19 @@ def test_no_grid_at_all_is_refused_with_the_commonest_reason():
         CalibrationError, match=r"no usable view among 3 images .3 x the image is blank"
     ):
         calibrate([(blank, 1000.0)] * 3)
+
+
+def test_pixel_sizes_of_files_without_a_microscopes_settings_are_stated(tmp_path):
+    """An OME-TIFF says its pixel size, and no more of the microscope."""
+    rng = np.random.default_rng(0)
+    for turn in (5.0, 25.0, 50.0):
+        picture = PatternBoard(20.0, turn_deg=turn, noise=4.0).picture(rng)
+        write_image(tmp_path / f"{turn:g}.tif", picture, PixelScale(500e-9))
+    with pytest.raises(UnusableCalibrationError, match="two readings of the scale"):
+        calibrate(tmp_path, squares_m=[12e-6], untilted="all")
+    done = calibrate(tmp_path, squares_m=[10e-6], untilted="all")
+    camera = done.at(done.magnification_range[0])
+    assert camera.pixel_size_m[0] == pytest.approx(500e-9, rel=5e-3)
 
 
 def test_what_cells_are_called_does_not_cost_a_view():
