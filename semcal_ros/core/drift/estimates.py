@@ -211,6 +211,9 @@ class DriftUpdate(DriftEstimate):
     moving
         What does not move with the specimen, in px of the rectified frame before its drift is removed; None where
         nothing was found.
+    fixed_share
+        Part of the frame that stays in place while the specimen drifts, such as a data bar or a burnt spot of the
+        detector, and was left out.
     of_scale
         (2, 2) the part of the covariance of the drift that is due to the scale of the camera, which changes metres and
         not pixels.
@@ -231,6 +234,7 @@ class DriftUpdate(DriftEstimate):
     along: Array | None = field(default=None, kw_only=True)
     unseen: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     moving: MovingTiles | None = field(default=None, kw_only=True)
+    fixed_share: float = field(default=0.0, kw_only=True)
     of_scale: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 
     @property

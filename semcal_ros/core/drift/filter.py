@@ -21,7 +21,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.drift.operations import AddKeyframe, Inflate, Measure, Operation, Predict
+from semcal_ros.core.drift.operations import (
+    AddKeyframe,
+    CloneKeyframe,
+    Inflate,
+    Measure,
+    Operation,
+    Predict,
+)
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.smoother import Event, Mark, estimate_process_noise, replay
 from semcal_ros.core.drift.state import DriftState
@@ -153,6 +160,21 @@ class DriftFilter:
                 near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
             self.process_noise = estimate_process_noise(self.start, self.events, near, (1.0,))
             self.state = replay(self.start, self.events, self.process_noise)
+
+    def widen_measurements(self, covariance: Array) -> None:
+        """Add a covariance (2, 2) of the shift to all measurements so far, or to the present drift where they are no
+        longer kept.
+        """
+        if not self._history and self.measured >= _ESTIMATE_AFTER[-1]:
+            both = np.zeros((6, 6))
+            both[:2, :2] = covariance
+            self.apply(Inflate(both))
+            return
+        self.events = [
+            event.widened(covariance) if isinstance(event, Measure | CloneKeyframe) else event
+            for event in self.events
+        ]
+        self.state = replay(self.start, self.events, self.process_noise)
 
     def set_flicker(self, flicker: Array) -> None:
         """Set the variances (4,) of :attr:`.process_noise.ProcessNoise.flicker`."""

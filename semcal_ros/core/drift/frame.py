@@ -20,11 +20,11 @@ the rolling shutter of a camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Mask, check_image
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -51,6 +51,8 @@ _SAMPLES = 96
 _EDGE_POINTS = 17
 # Steps in which a region shrinks until all of its edges were scanned; distortion takes 2.
 _MAX_SHRINKS = 4
+# A pixel of which a larger part is fixed does not show the specimen.
+_PART_OF_FIXED = 0.05
 # Pixels that a cubic interpolation reaches beyond a position.
 _REACH_PX = 2.0
 
@@ -69,12 +71,15 @@ class ScanFrame:
         Its raster timing, or None for an instant.
     rectified
         Whether the image already is in the camera's rectified pixels.
+    fixed
+        (h, w) True at pixels that do not show the specimen, and are filled from around; None where all do.
     """
 
     image: AnyImage
     camera: ScanCamera | None
     timing: ScanTiming | None
     rectified: bool = False
+    fixed: Mask | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -169,6 +174,22 @@ class MotionCorrector:
             return self._turning.rectify(raw, camera, drift, frame.timing), region
         image = self._rectifier.rectify(frame.image, camera, drift, frame.timing)
         return image, region
+
+    def corrected_mask(
+        self,
+        frame: ScanFrame,
+        motion: Array,
+        turn: Array | None = None,
+        turn_rate: Array | None = None,
+    ) -> Mask | None:
+        """The pixels of the corrected image that do not show the specimen, not even in part; arguments as for
+        :meth:`corrected_image`. None where all do.
+        """
+        if frame.fixed is None:
+            return None
+        drawn = replace(frame, image=np.where(frame.fixed, np.float32(1.0), np.float32(0.0)))
+        image, _ = self.corrected_image(drawn, motion, turn, turn_rate)
+        return np.asarray(np.asarray(image, dtype=np.float32) > _PART_OF_FIXED)
 
 
 def _turned(

@@ -26,8 +26,9 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array, Image
+from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
 from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.fractional_delay import FINE, sample_shifted
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.register import Registration, prepare_reference, to_gray
@@ -67,6 +68,8 @@ class Keyframe:
         Number of frames in the mean.
     turn
         (2,) rotation and scale that were removed from the first frame.
+    fixed
+        (h, w) True at pixels of the mean that do not show the specimen; None where all do.
     """
 
     frame: ScanFrame
@@ -76,6 +79,7 @@ class Keyframe:
     time_s: float
     averaged: int = 1
     turn: Array = field(default_factory=lambda: np.zeros(2))
+    fixed: Mask | None = None
 
     @property
     def nbytes(self) -> int:
@@ -91,10 +95,19 @@ class Keyframe:
             settings=settings,
             averaged=float(self.averaged),
             raw=raw if raw.shape == self.mean.shape else None,
+            fixed=self.fixed,
         )
 
-    def with_frame(self, image: AnyImage, region: Region, registration: Registration) -> Keyframe:
-        """The keyframe with another frame in its mean, where the two overlap."""
+    def with_frame(
+        self,
+        image: AnyImage,
+        region: Region,
+        registration: Registration,
+        fixed: Mask | None = None,
+    ) -> Keyframe:
+        """The keyframe with another frame in its mean, where the two overlap and the frame shows the specimen: not
+        at its pixels ``fixed`` (h, w).
+        """
         gray = np.asarray(to_gray(image), dtype=np.float32)
         shift = registration.shift_px
         whole = np.floor(shift).astype(int)
@@ -112,15 +125,21 @@ class Keyframe:
         if min(right - left, bottom - top) < _MIN_COMMON_PX:
             return self
         plain = np.array([1.0])
+        # By a gain that the noise of the reference lowers, each mean would have more contrast than the one before.
+        contrast, alignment = registration.contrast, registration.alignment
+        offset = alignment.offset + (alignment.gain - contrast) * float(np.mean(self.mean))
         corner = left + int(whole[0]), top + int(whole[1])
         size = right - left, bottom - top
-        moved = sample_shifted(
-            gray, corner, size, shift - whole, plain, FINE, -registration.alignment.offset
-        )
+        moved = sample_shifted(gray, corner, size, shift - whole, plain, FINE, -offset)
         mean = self.mean.copy()
         part = mean[top:bottom, left:right]
         share = np.float32(1.0 / (self.averaged + 1))
-        part += (moved * np.float32(1.0 / registration.alignment.gain) - part) * share
+        change = (moved * np.float32(1.0 / contrast) - part) * share
+        if fixed is not None:
+            # Its place is filled from around, without the structure that the mean has there.
+            around = grow_mask(fixed, FINE.reach)
+            change[around[corner[1] : corner[1] + size[1], corner[0] : corner[0] + size[0]]] = 0.0
+        part += change
         return replace(self, mean=mean, averaged=self.averaged + 1)
 
 
@@ -131,13 +150,14 @@ def make_keyframe(
     region: Region,
     time_s: float,
     turn: Array | None = None,
+    fixed: Mask | None = None,
 ) -> Keyframe:
     """A keyframe from a frame and its image without the motion ``removed`` (4,) and the rotation and scale
-    ``turn`` (2,).
+    ``turn`` (2,), which does not show the specimen at its pixels ``fixed`` (h, w).
     """
     gray = np.array(to_gray(image), dtype=np.float32)
     turned = np.zeros(2) if turn is None else turn.copy()
-    return Keyframe(frame, removed.copy(), gray, region, time_s, turn=turned)
+    return Keyframe(frame, removed.copy(), gray, region, time_s, turn=turned, fixed=fixed)
 
 
 def scale_ratio(before: ScanFrame, now: ScanFrame) -> float:
@@ -171,7 +191,11 @@ def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
     new = cv2.warpAffine(gray, warp, (width, height), flags=cv2.INTER_CUBIC)
     region = _map_region(key.region, matrix, offset, now.size)
     mean = np.asarray(new, dtype=np.float32)
-    return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged, key.turn)
+    fixed = None
+    if key.fixed is not None:
+        drawn = cv2.warpAffine(key.fixed.astype(np.float32), warp, (width, height))
+        fixed = np.asarray(drawn > 0.0)
+    return Keyframe(now, key.removed, mean, region, key.time_s, key.averaged, key.turn, fixed)
 
 
 def _map_region(region: Region, matrix: Array, offset: Array, size: tuple[int, int]) -> Region:

@@ -187,6 +187,12 @@ class CloneKeyframe(Operation):
     noise: Array
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
+    def widened(self, covariance: Array) -> CloneKeyframe:
+        """The same with a covariance (2, 2) added to that of the shift."""
+        noise = self.noise.copy()
+        noise[:2, :2] += covariance
+        return replace(self, noise=noise)
+
     def transition(self, state: DriftState, process_noise: ProcessNoise) -> Transition:
         """The map; see the base class."""
         size = state.mean.size
@@ -294,6 +300,16 @@ class Measure:
     acceleration_term_s2: float = 0.0
     scan_s: float = 0.0
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
+
+    def widened(self, covariance: Array) -> Measure:
+        """The same with a covariance (2, 2) added to that of the shift, and to that of the shear as if it had grown by
+        as much in the time of a scan.
+        """
+        wider = self.covariance.copy()
+        wider[:2, :2] += covariance
+        if self.shift.size > 2 and self.scan_s > 0.0:
+            wider[2:, 2:] += covariance / self.scan_s**2
+        return replace(self, covariance=wider)
 
     def jacobian(self, state: DriftState) -> Array:
         """(2 or 4, n) derivative of the measurement with respect to the state."""

@@ -45,6 +45,7 @@ from semcal_ros.core.drift.estimates import (
     forget_prior,
 )
 from semcal_ros.core.drift.filter import DriftFilter
+from semcal_ros.core.drift.fixed_parts import LEAST_MOVE_PX, find_fixed_parts
 from semcal_ros.core.drift.flicker import FlickerEstimator
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.gating import (
@@ -96,6 +97,9 @@ _MIN_CORRELATION = 0.75
 # What frames must be like to become part of their keyframe's mean: a higher correlation, a gain
 # within a factor of two, and a shear that does not blur it.
 _MIN_MERGE_CORRELATION, _MERGE_GAINS, _MAX_MERGE_SHEAR_PX = 0.85, (0.5, 2.0), 0.1
+# Standard deviations of a measured shear within which it may be none, and the largest one then: a quarter of a pixel to
+# either side at the upper and the lower edge blurs structure at a third of a cycle per pixel by 4 % there.
+_OPEN_SIGMAS, _MAX_BLUR_PX = 2.0, 0.5
 # A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
 # noise weighs otherwise than as an image, and other parts of it are compared. Of the variance of the
 # frame's noise, this part, and this part times the fraction that did not overlap, as seen in the
@@ -115,8 +119,26 @@ _MAX_TURN_PX = 0.1
 _MIN_INTERVAL_S = 1e-9
 # Frames in which an overlay is looked for: the first ones, and then every so many.
 _FIRST_LOOKS, _LOOK_EVERY = 3, 8
+# What stays in place is looked for as soon as the specimen has moved, the first times, and then after so many frames.
+_FIXED_FIRST, _FIXED_LATER = 4, 32
+# Part of the image that must newly be found to stay, for keyframes to be freed of it.
+_NEWLY_FIXED = 2e-4
 # What an image looks like that shows another place: the prediction need not hold.
 _ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
+
+
+@dataclass
+class _FixedTrack:
+    """What stays in place while the specimen drifts: ``mask`` (h, w), from as many comparisons as ``looks`` with the
+    frame ``image``, ``since`` frames ago, at the drift ``drift_px`` (2,).
+    """
+
+    image: AnyImage | None = None
+    drift_px: Array = field(default_factory=lambda: np.zeros(2))
+    px_from_unit: Array = field(default_factory=lambda: np.eye(2))
+    since: int = 0
+    looks: int = 0
+    mask: Mask | None = None
 
 
 @dataclass
@@ -127,7 +149,8 @@ class _Track:
     ``rejected`` is the number of frames in a row that did not match. ``doubt`` (2, 2) is what the last
     frames that contradict the prediction add to the covariance of the drift, until one matches. ``apart`` says whether
     something in the last frame that matched did not move with the specimen. ``before`` is the last frame as it came,
-    and ``overlay`` what is drawn into all of them, of which there were ``seen``. Where the specimen shows lines only,
+    ``overlay`` what is drawn into all of them, of which there were ``seen``, and ``fixed`` what else stays in place.
+    Where the specimen shows lines only,
     ``along`` (2,) is their direction in px, ``unseen`` what was known before the first frame that did not tell the
     drift along them, ``of_unseen`` (2, 2) what that adds to the covariance of the last frame, and ``blind`` the
     keyframes that were made since, whose own place along the lines was only predicted.
@@ -145,6 +168,7 @@ class _Track:
     before: AnyImage | None = None
     overlay: Mask | None = None
     seen: int = 0
+    fixed: _FixedTrack = field(default_factory=_FixedTrack)
     along: Array | None = None
     unseen: DriftState | None = None
     of_unseen: Array = field(default_factory=lambda: np.zeros((2, 2)))
@@ -194,8 +218,8 @@ class _Match:
         The keyframe.
     registration
         Shift in px.
-    image, region
-        The frame as it was compared, and the part of it that was scanned.
+    image, region, fixed
+        The frame as it was compared, the part of it that was scanned, and the pixels that do not show the specimen.
     removed
         (4,) drift velocity and acceleration that were removed from it.
     measure
@@ -210,6 +234,7 @@ class _Match:
     registration: Registration
     image: AnyImage
     region: Region
+    fixed: Mask | None
     removed: Array
     measure: Measure
     keyframe_time_s: float
@@ -323,9 +348,15 @@ class DriftTracker:
             track, update = self._begin(frame, centre_s)
             self._track = track
         else:
-            frame = self._without_overlay(track, frame)
+            self._look_for_overlay(track, frame)
+            frame = _without_fixed(track, frame)
             self._predict(track, frame, centre_s)
             update = self._follow(track, frame)
+            if update.accepted and self._look_for_fixed(track, frame, pixels):
+                # What was found has pulled this frame, too.
+                track.sample = b""
+                frame = _without_fixed(track, frame)
+                update = self._follow(track, frame)
         if track.seen < _FIRST_LOOKS or (track.seen + 1) % _LOOK_EVERY == 0:
             track.before = pixels.copy()
         track.filter.mark_frame()
@@ -336,8 +367,8 @@ class DriftTracker:
             self._history.add(update, fitted)
         return update
 
-    def _without_overlay(self, track: _Track, frame: ScanFrame) -> ScanFrame:
-        """The frame without what is drawn into it; the first time, the keyframes are freed of it, too."""
+    def _look_for_overlay(self, track: _Track, frame: ScanFrame) -> None:
+        """Look for what is drawn into the frames; the first time, the keyframes are freed of it."""
         track.seen += 1
         looks = track.seen <= _FIRST_LOOKS or track.seen % _LOOK_EVERY == 0
         if looks and track.before is not None and not np.array_equal(track.before, frame.image):
@@ -345,25 +376,55 @@ class DriftTracker:
             is_new = found is not None and track.overlay is None
             track.overlay = found
             if is_new:
-                for key in track.store.keys:
-                    self._clean_keyframe(track, key)
-        overlay = track.overlay
-        if overlay is None or overlay.shape != frame.image.shape[:2]:
-            return frame
-        return replace(frame, image=remove_overlay(frame.image, overlay))
+                self._clean_keyframes(track)
 
-    def _clean_keyframe(self, track: _Track, key: int) -> None:
-        old, overlay = track.store[key], track.overlay
-        if overlay is None or overlay.shape != old.frame.image.shape[:2]:
-            return
-        frame = replace(old.frame, image=remove_overlay(old.frame.image, overlay))
-        self._remake_keyframe(track, key, frame, old.removed)
+    def _look_for_fixed(self, track: _Track, frame: ScanFrame, pixels: AnyImage) -> bool:
+        """Look for what stays in place between a frame that was measured, as it came (``pixels``), and an earlier one,
+        once the specimen has moved; the keyframes are freed of what is new. Whether there was any.
+        """
+        is_new = False
+        fixed, drift_px = track.fixed, frame.px_from_unit @ track.filter.state.position
+        fixed.since += 1
+        if (
+            fixed.image is not None
+            and fixed.image.shape == pixels.shape
+            and np.allclose(fixed.px_from_unit, frame.px_from_unit)
+        ):
+            every = 1 if fixed.looks < _FIXED_FIRST else _FIXED_LATER
+            moved_px = drift_px - fixed.drift_px
+            if fixed.since < every or np.hypot(*moved_px) < LEAST_MOVE_PX:
+                return False
+            fixed.looks += 1
+            found = find_fixed_parts(fixed.image, pixels, moved_px)
+            if found is not None:
+                known = np.zeros_like(found.stays) if fixed.mask is None else fixed.mask
+                fixed.mask = found.stays | (known & ~found.moves)
+                is_new = float(np.mean(found.stays & ~known)) > _NEWLY_FIXED
+                if is_new:
+                    # What stays pulls to where it is: by the whole of the motion at most.
+                    moved = np.linalg.solve(frame.px_from_unit, moved_px)
+                    track.filter.widen_measurements(np.outer(moved, moved))
+                    self._clean_keyframes(track)
+        elif fixed.mask is not None and fixed.mask.shape != pixels.shape[:2]:
+            fixed.mask = None
+        fixed.image, fixed.drift_px, fixed.since = pixels.copy(), drift_px, 0
+        fixed.px_from_unit = frame.px_from_unit
+        return is_new
+
+    def _clean_keyframes(self, track: _Track) -> None:
+        """Free all keyframes of what is now known not to be the specimen."""
+        for key in track.store.keys:
+            old = track.store[key]
+            frame = _without_fixed(track, old.frame)
+            if frame is not old.frame:
+                self._remake_keyframe(track, key, frame, old.removed)
 
     def _remake_keyframe(self, track: _Track, key: int, frame: ScanFrame, removed: Array) -> None:
         """Replace a keyframe by one of a single frame, freed of a motion."""
         old = track.store[key]
         image, region = self._corrector.corrected_image(frame, removed, old.turn)
-        keyframe = make_keyframe(frame, removed, image, region, old.time_s, old.turn)
+        fixed = self._corrector.corrected_mask(frame, removed, old.turn)
+        keyframe = make_keyframe(frame, removed, image, region, old.time_s, old.turn, fixed)
         track.store.replace(key, keyframe)
 
     # -- the first frame --------------------------------------------------------------------------
@@ -412,7 +473,8 @@ class DriftTracker:
         """A frame as a keyframe, and the reference that it would be."""
         turn, time_s = track.similarity.position, track.filter.state.time_s
         image, region = self._corrector.corrected_image(frame, removed, turn, track.similarity.rate)
-        keyframe = make_keyframe(frame, removed, image, region, time_s, turn)
+        fixed = self._corrector.corrected_mask(frame, removed, turn, track.similarity.rate)
+        keyframe = make_keyframe(frame, removed, image, region, time_s, turn, fixed)
         return keyframe, keyframe.prepare_reference(self.settings.registration)
 
     # -- every other frame ------------------------------------------------------------------------
@@ -551,7 +613,9 @@ class DriftTracker:
     ) -> _Match | _RejectedMatch:
         """Register a frame that is corrected for a motion, a rotation and a scale."""
         store, key = track.store, candidate.key
-        image, region = self._corrector.corrected_image(frame, motion, turn, track.similarity.rate)
+        rate = track.similarity.rate
+        image, region = self._corrector.corrected_image(frame, motion, turn, rate)
+        fixed = self._corrector.corrected_mask(frame, motion, turn, rate)
         reference = (
             store.resampled_reference(key, frame) if candidate.rescaled else store.reference(key)
         )
@@ -570,6 +634,7 @@ class DriftTracker:
             max_shear_px=_MAX_SHEAR * frame.size[1],
             apart=track.apart,
             takes_lines=True,
+            fixed=fixed,
         )
         if registration.rejection is not None:
             return _RejectedMatch(registration.rejection, registration)
@@ -585,7 +650,15 @@ class DriftTracker:
         if track.filter.pending == key:
             track.filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
         return _Match(
-            candidate, registration, image, region, motion, measure, keyframe.time_s, similarity
+            candidate,
+            registration,
+            image,
+            region,
+            fixed,
+            motion,
+            measure,
+            keyframe.time_s,
+            similarity,
         )
 
     def _correct_keyframe(self, track: _Track, candidate: Candidate, state: DriftState) -> bool:
@@ -722,7 +795,7 @@ class DriftTracker:
         elif self.settings.average and track.unseen is None and _is_mergeable(match, store):
             # Not of lines alone: what came into the picture since would be where it was predicted to be.
             keyframe = store[candidate.key]
-            mean = keyframe.with_frame(match.image, match.region, registration)
+            mean = keyframe.with_frame(match.image, match.region, registration, match.fixed)
             store.replace(candidate.key, mean)
             merged = True
         update = _make_update(track, frame, status, registration=registration)
@@ -822,13 +895,19 @@ def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
     """Whether a frame makes the mean of its keyframe better."""
     registration, candidate = match.registration, match.candidate
     alignment = registration.alignment
-    shear_px = np.nan_to_num(alignment.joint_px[2:], nan=0.0)
+    shear_px = np.abs(np.nan_to_num(alignment.joint_px[2:], nan=0.0))
+    sigma_px = np.sqrt(np.diag(alignment.joint_covariance)[2:])
+    # A few particles tell a shear badly: what they leave open is none.
+    shows_shear = shear_px > _MAX_MERGE_SHEAR_PX + _OPEN_SIGMAS * np.where(
+        np.isfinite(sigma_px), sigma_px, 0.0
+    )
     return (
         not candidate.rescaled
         and store.has_room(candidate.key, alignment.overlap)
         and registration.correlation > _MIN_MERGE_CORRELATION
-        and _MERGE_GAINS[0] < alignment.gain < _MERGE_GAINS[1]
-        and float(np.max(np.abs(shear_px))) < _MAX_MERGE_SHEAR_PX
+        and _MERGE_GAINS[0] < registration.contrast < _MERGE_GAINS[1]
+        and not np.any(shows_shear)
+        and float(np.max(shear_px)) < _MAX_BLUR_PX
     )
 
 
@@ -836,7 +915,9 @@ def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noi
     """Make this frame a keyframe, as it was measured against the one before; its number."""
     state = track.filter.state
     turn = match.similarity.removed
-    keyframe = make_keyframe(frame, match.removed, match.image, match.region, state.time_s, turn)
+    keyframe = make_keyframe(
+        frame, match.removed, match.image, match.region, state.time_s, turn, match.fixed
+    )
     key, forgotten = track.store.add(keyframe)
     track.filter.apply(clone_keyframe(key, state, measure, match.removed, noise))
     if match.candidate.rescaled:
@@ -848,6 +929,16 @@ def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noi
     for old in forgotten:
         track.forget(old)
     return key
+
+
+def _without_fixed(track: _Track, frame: ScanFrame) -> ScanFrame:
+    """The frame with the place of what does not show the specimen filled from around, as far as it is known."""
+    masks = [m for m in (track.overlay, track.fixed.mask) if m is not None]
+    masks = [m for m in masks if m.shape == frame.image.shape[:2]]
+    fixed = np.logical_or.reduce(masks) if masks else np.zeros(1, dtype=bool)
+    if not np.any(fixed):
+        return frame
+    return replace(frame, image=remove_overlay(frame.image, fixed), fixed=fixed)
 
 
 def _make_update(
@@ -906,5 +997,6 @@ def _make_update(
         unseen=unseen,
         along=track.along,
         moving=None if registration is None else registration.moving,
+        fixed_share=0.0 if frame.fixed is None else float(np.mean(frame.fixed)),
         of_scale=of_scale[:2, :2],
     )

@@ -141,8 +141,9 @@ class Agreement:
         return bool(areas[areas >= _BODY_TILES].sum() > 0.6 * tiles)
 
 
-def information_weights(gradient: Array, pixels: float, sigma_px: float, noise: TileNoise) -> Array:
-    """(rows, cols) 0 to 1: what of the gradients of tiles (rows, cols, 2, 2) is structure and not noise.
+def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise) -> Array:
+    """(rows, cols) 0 to 1: what of the gradients of tiles (rows, cols, 2, 2) of so many ``pixels`` (rows, cols) is
+    structure and not noise.
 
     A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
     """
@@ -162,7 +163,9 @@ def find_agreement(tiles: TileStatistics, noise: TileNoise) -> Agreement:
     gain = _bound_gain(tiles, noise, weights)
     raw = tiles.image - 2.0 * gain * tiles.common + gain**2 * tiles.reference
     # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.
-    least = float(np.quantile(raw, _BEST_TILES)) / count
+    # A tile of which little counts may leave anything.
+    whole = count >= 0.5 * float(np.max(count))
+    least = float(np.quantile((raw / count)[whole], _BEST_TILES))
     floor = gain**2 * noise.reference + noise.image
     hidden = max(1.0, least / max(float(np.median(floor)), 1e-30))
     floor = hidden * floor

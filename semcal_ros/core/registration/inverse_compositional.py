@@ -84,6 +84,9 @@ _MAX_COARSE_PASSES = 4
 _LEAST_FREEDOM = 8.0
 # Fewer than this make up most of the information only where it lies in lone particles.
 _FEW_SCORES = 12.0
+# Then the covariance that the residuals of the pixels lead to counts as that of so many scores: what moves a particle
+# as a whole, such as a change of its shape, is seen by the scatter of the scores alone.
+_EXPECTED_SCORES = 6.0
 # Probability below three standard deviations.
 _THREE_SIGMAS = 0.99865
 # Less of a gain is that of another place.
@@ -229,7 +232,7 @@ class TileStatistics:
     rows, cols
         The tiles of the reference that are compared.
     pixels
-        Number of pixels of a tile.
+        (rows, cols) number of pixels of each tile that count, at least 1.
     sigma_px
         Width of the smoothing.
     reference, image, common
@@ -244,7 +247,7 @@ class TileStatistics:
 
     rows: slice
     cols: slice
-    pixels: float
+    pixels: Array
     sigma_px: float
     reference: Array
     image: Array
@@ -263,7 +266,7 @@ def _make_statistics(
     level: PyramidLevel, window: TileWindow, sums: TileSums, gain: Array
 ) -> TileStatistics:
     own, cross = level.normal_matrices[window.rows, window.cols], sums.cross
-    pixels, shape = float(own[0, 0, 3, 3]), own.shape[:2]
+    pixels, shape = level.pixel_counts[window.rows, window.cols], own.shape[:2]
     gain = gain.reshape(shape)
     # The offset of each tile is its own: charging and shading say nothing of the shift.
     offset = (cross[..., 3] - gain * own[..., 2, 3]) / pixels
@@ -326,7 +329,8 @@ def unmeasured_alignment() -> Alignment:
 class _Comparison:
     """The pixels of one level compared at one shift; shifts in px of the level.
 
-    ``plain`` are the sums without weights of the tiles.
+    ``plain`` are the sums without weights of the tiles, and ``noise`` is the variance per pixel that the squares of the
+    reference in the geometry lack.
     """
 
     level: PyramidLevel
@@ -338,6 +342,7 @@ class _Comparison:
     shift: Array
     image_size: tuple[int, int]
     mean: float
+    noise: float = 0.0
 
     @property
     def length(self) -> float:
@@ -525,7 +530,8 @@ def _compare(
         return _find_chance_gradient(level, geometry, information, enough) or Rejection(
             MatchFailure.UNDETERMINED, _FEATURELESS
         )
-    return _Comparison(level, window, geometry, sums, plain, fit, shift, size, image.mean)
+    lacks = 0.0 if weights is None else noise
+    return _Comparison(level, window, geometry, sums, plain, fit, shift, size, image.mean, lacks)
 
 
 def _find_chance_gradient(
@@ -569,15 +575,25 @@ def _covariance(comparison: _Comparison) -> Array:
     of the noise.
     """
     inverse = invert_symmetric(comparison.fit.information)
-    return _robust_covariance(comparison, comparison.fit.scores, inverse)
+    alone = np.ones((len(comparison.fit.scores), 1))
+    return _robust_covariance(comparison, comparison.fit.scores, inverse, alone)
 
 
-def _robust_covariance(comparison: _Comparison, scores: Array, inverse: Array) -> Array:
+def _robust_covariance(
+    comparison: _Comparison, scores: Array, inverse: Array, powers: Array
+) -> Array:
     """Covariance from the scatter of blocks, and of whole rows of tiles where that is clearly
     larger: lines of a scan may be shifted or shaded as a whole.
+
+    ``scores`` (n, 2 p) are those of the shift times each of the ``powers`` (n, p).
     """
     blocks = _sum_blocks(comparison, scores)
-    covariance = _sandwich_covariance(blocks, inverse) * _widen_few(blocks, inverse)
+    covariance = _sandwich_covariance(blocks, inverse)
+    count = _count_scores(blocks, inverse)
+    if count < _FEW_SCORES:
+        expected = inverse @ _expect_spread(comparison, powers) @ inverse.T
+        covariance = (count * covariance + _EXPECTED_SCORES * expected) / (count + _EXPECTED_SCORES)
+        covariance *= _widen_few(count + _EXPECTED_SCORES, blocks.shape[1], len(blocks))
     cols = comparison.window.cols.stop - comparison.window.cols.start
     rows = scores.reshape(-1, cols, scores.shape[1]).sum(axis=1)
     if len(rows) < _MIN_NOISE_ROWS:
@@ -596,17 +612,35 @@ def _sandwich_covariance(blocks: Array, inverse: Array) -> Array:
     return np.asarray(inverse @ spread @ inverse.T)
 
 
-def _widen_few(blocks: Array, inverse: Array) -> float:
-    """By how much the covariance of scores is larger where a few of them, as of lone particles, make up most of it.
+def _count_scores(blocks: Array, inverse: Array) -> float:
+    """Number of scores that make up most of the scatter: few where there are lone particles."""
+    squares = np.einsum("bi,bi->b", blocks @ inverse, blocks)
+    return float(squares.sum() ** 2 / max(float(squares @ squares), 1e-300))
+
+
+def _expect_spread(comparison: _Comparison, powers: Array) -> Array:
+    """(2 p, 2 p) covariance of the sum of all scores as the residuals of each tile's pixels tell it.
+
+    A tile has some hundred pixels, and only two scores: of a few tiles it is the better estimate. It does not see what
+    moves a tile as a whole.
+    """
+    tiles, level, window = _measure_tiles(comparison), comparison.level, comparison.window
+    residual = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
+    counts = level.pixel_counts[window.rows, window.cols]
+    weights = comparison.geometry.normal_matrices[:, 3, 3] / counts.ravel()
+    products = level.noise_products[window.rows, window.cols].reshape(-1, 2, 2)
+    variances = weights**2 * np.maximum(residual / counts, 0.0).ravel()
+    both = np.einsum("tp,tq,t,tij->piqj", powers, powers, variances, products)
+    return np.asarray(both.reshape(2 * powers.shape[1], -1))
+
+
+def _widen_few(count: float, estimated: int, blocks: int) -> float:
+    """By how much the covariance from so many scores is larger than that from many.
 
     Three sigmas then hold as of a Gaussian, although the sigma is that of few scores (Student's t).
     """
-    squares = np.einsum("bi,bi->b", blocks @ inverse, blocks)
-    count = float(squares.sum() ** 2 / max(float(squares @ squares), 1e-300))
-    if count >= _FEW_SCORES:
-        return 1.0
-    freedom = max(count - blocks.shape[1], _LEAST_FREEDOM)
-    few = blocks.shape[1] / freedom - blocks.shape[1] / max(len(blocks), 1)
+    freedom = max(count - estimated, _LEAST_FREEDOM)
+    few = estimated / freedom - estimated / max(blocks, 1)
     return (float(stdtrit(freedom, _THREE_SIGMAS)) / 3.0) ** 2 * (1.0 + max(few, 0.0))
 
 
@@ -633,7 +667,8 @@ def _summarise(
         gain=gain,
         offset=float(fit.offset[0]) + comparison.mean - gain * level.mean,
         residual_rms=float(np.sqrt(max(error, 0.0) / pixels)),
-        reference_variance=float(whole[2, 2] - whole[2, 3] ** 2 / pixels) / pixels,
+        reference_variance=float(whole[2, 2] - whole[2, 3] ** 2 / pixels) / pixels
+        + comparison.noise,
         image_variance=float(comparison.sums.energy.sum() - cross[3] ** 2 / pixels) / pixels,
         common_covariance=float(cross[2] - whole[2, 3] * cross[3] / pixels) / pixels,
         overlap=_overlap_fraction(level.size, comparison.image_size, comparison.improved),
@@ -714,7 +749,8 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     explained = weights.reshape(rows, cols, 2, 2) @ steps[:, None, :, None]
     residual = scores + explained[..., 0]
     tilted = np.concatenate([residual, powers[:, 1, None, None] * residual], axis=2)
-    return joint, _robust_covariance(comparison, tilted.reshape(-1, 4), inverse)
+    each = np.repeat(powers, cols, axis=0)
+    return joint, _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
 
 
 def _well_conditioned(matrix: Array) -> bool:
@@ -769,7 +805,7 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     explained = np.einsum("tij,tj->ti", weights, powers @ step.reshape(3, 2))
     residual = comparison.fit.scores + explained
     scores = (powers[:, :, None] * residual[:, None, :]).reshape(-1, 6)
-    covariance = _robust_covariance(comparison, scores, inverse)
+    covariance = _robust_covariance(comparison, scores, inverse, powers)
     step[:2] += comparison.shift
     # The last row minus the first; along a row, what changes is scale (x) and rotation (y).
     aspect = height / width
@@ -794,8 +830,7 @@ def tile_residual_energies(
         return None
     energies = np.full(level.normal_matrices.shape[:2], np.nan)
     squares = squared_residuals(comparison.geometry, comparison.sums, comparison.fit)
-    means = squares / level.normal_matrices[0, 0, 3, 3]
-    energies[comparison.window.rows, comparison.window.cols] = means.reshape(
-        len(comparison.window.y), -1
-    )
+    window = comparison.window
+    counts = level.pixel_counts[window.rows, window.cols]
+    energies[window.rows, window.cols] = squares.reshape(counts.shape) / counts
     return energies

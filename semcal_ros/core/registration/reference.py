@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
 from semcal_ros.core.registration.one_direction import OneDirection, find_direction
@@ -108,6 +108,11 @@ class Reference:
         Limits of acceptance.
     is_sparse
         Whether most of it has no structure.
+    fixed
+        (h, w) of its region, True at pixels that do not show the specimen; None where all do.
+    whole
+        The reference with all of its pixels, of which this one is a part
+        (:func:`~semcal_ros.core.registration.fixed_pixels.drop_fixed_pixels`); None where it is the whole.
     """
 
     region: Region
@@ -117,10 +122,14 @@ class Reference:
     defect: str
     settings: RegistrationSettings = field(default_factory=RegistrationSettings)
     is_sparse: bool = False
+    fixed: Mask | None = None
+    whole: Reference | None = field(default=None, repr=False)
 
     @cached_property
     def lines(self) -> OneDirection | None:
         """The direction of its lines, if it shows nothing else; looked for when first asked."""
+        if self.whole is not None:
+            return self.whole.lines
         if not self.levels:
             return None
         return find_direction(self.levels, self.coarse.pyramid, self.noise_variance)
@@ -128,4 +137,6 @@ class Reference:
     @cached_property
     def periods(self) -> Array:
         """(k, 2) periods of what repeats, px; looked for when first asked."""
+        if self.whole is not None:
+            return self.whole.periods
         return find_periods(self.coarse.pyramid.centred(1), self.noise_variance)

@@ -35,12 +35,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, check_image
+from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Mask, check_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.acceptance import find_failure
 from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.ambiguity import choose_peak, compare_residuals
 from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.fixed_pixels import drop_fixed_pixels
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
     SimilarityFit,
@@ -102,6 +103,8 @@ _MIN_SIGNAL_SHARE = 0.02
 
 # Where an image that shows more than lines fits worse: beyond the width of any detail.
 _FARTHER_PX = 8.0
+# Fixed pixels are dropped at the predicted shift, and again at the one that was found where it is farther away.
+_MOST_DROPPED, _DROPPED_WITHIN_PX = 3, 1.0
 # Less than this of the structure agrees where images are of two motions, though no part was found to be one.
 _MUCH_AGREES = 0.85
 
@@ -129,6 +132,9 @@ class Registration:
     correlation
         Correlation of the two images over the overlap after their noise has been accounted for,
         at most 1; NaN where nothing could be measured.
+    contrast
+        Standard deviation of the image over that of the reference after their noise has been accounted for; NaN where
+        nothing could be measured. Noise of the reference lowers the gain of the alignment, and not this ratio.
     rejection
         Why the shift must not be used; None where it may.
     nearest_px
@@ -150,6 +156,7 @@ class Registration:
     moving: MovingTiles | None = None
     share: float = 1.0
     along: Array | None = None
+    contrast: float = float("nan")
 
     _middle_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
     _origin_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
@@ -238,6 +245,7 @@ def prepare_reference(
     settings: RegistrationSettings | None = None,
     averaged: float = 1.0,
     raw: AnyImage | None = None,
+    fixed: Mask | None = None,
 ) -> Reference:
     """Precompute what :func:`register` needs of a reference that is used many times.
 
@@ -254,6 +262,8 @@ def prepare_reference(
     raw
         One of these images, grey and of the same size, before it was resampled, whose noise is white;
         None if they were not.
+    fixed
+        (h, w) True at pixels that do not show the specimen, whose place is filled from around; None where all do.
 
     Raises
     ------
@@ -290,8 +300,16 @@ def prepare_reference(
             levels.append(level)
     if not levels:
         defect = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
+    left, top, right, bottom = inside
     return Reference(
-        inside, coarse, tuple(levels), statistics.noise_variance, defect, limits, is_sparse
+        inside,
+        coarse,
+        tuple(levels),
+        statistics.noise_variance,
+        defect,
+        limits,
+        is_sparse,
+        None if fixed is None else fixed[top:bottom, left:right],
     )
 
 
@@ -360,6 +378,7 @@ def register(
     max_shear_px: float = 0.0,
     apart: bool = False,
     takes_lines: bool = False,
+    fixed: Mask | None = None,
 ) -> Registration:
     """Measure the shift of ``image`` against a prepared reference.
 
@@ -383,6 +402,9 @@ def register(
     takes_lines
         Whether a shift across lines is of use, with the predicted one along them (:attr:`Registration.along`). It is
         measured only where there is a covariance of the prediction.
+    fixed
+        (h, w) True at pixels of the image that do not show the specimen, whose place is filled from around, so that it
+        does not show in the search over all shifts; None where all do. They take no part in the shift.
 
     Returns
     -------
@@ -394,15 +416,24 @@ def register(
     InvalidValueError
         If the shape or type is not that of an image, or the region does not lie in it.
     """
-    found = _register(
-        reference,
-        image,
-        guess_px=guess_px,
-        guess_covariance=guess_covariance,
-        image_region=image_region,
-        max_shear_px=max_shear_px,
-        apart=apart,
-    )
+    _, inside = _crop(image, image_region)
+    dropped_at = np.asarray(guess_px, dtype=np.float64)
+    for _ in range(_MOST_DROPPED):
+        part = drop_fixed_pixels(reference, fixed, inside, dropped_at)
+        found = _register(
+            part,
+            image,
+            guess_px=guess_px,
+            guess_covariance=guess_covariance,
+            image_region=image_region,
+            max_shear_px=max_shear_px,
+            apart=apart,
+        )
+        away_px = np.abs(found.shift_px - dropped_at)
+        if part is reference or not np.any(away_px > _DROPPED_WITHIN_PX):
+            break
+        dropped_at = found.shift_px
+    reference = part
     if reference.defect or guess_covariance is None or reference.lines is None:
         return found
     # A shift along lines may be one of noise.
@@ -471,7 +502,8 @@ def _register_across(
     peak, alignment = found
     image_noise = estimate_noise_variance(_texture(gray, inside, limits))
     whole = look_at_whole(reference, alignment, image_noise)
-    correlation = _correct_correlation(reference, image_noise, alignment)
+    signals = _measure_signals(reference, image_noise, alignment)
+    correlation = signals.correlation
     # Only the direction across is judged.
     sigma2 = float(lines.across @ alignment.covariance @ lines.across)
     rejection = find_failure(
@@ -484,7 +516,7 @@ def _register_across(
     if rejection is None and follow_px is not None:
         rejection = refuse_unless_followed(reference, alignment, image_noise, follow_px)
     moved = replace(alignment, shift_px=alignment.shift_px + origin)
-    return Registration(moved, correlation, rejection, along=lines.along)
+    return Registration(moved, correlation, rejection, along=lines.along, contrast=signals.contrast)
 
 
 def _register(
@@ -572,7 +604,8 @@ def _register(
     if isinstance(alignment, Rejection):
         named = _name_deformation(alignment, reference, pyramid)
         return Registration(unmeasured_alignment(), float("nan"), named)
-    correlation = _correct_correlation(reference, image_noise, alignment)
+    signals = _measure_signals(reference, image_noise, alignment)
+    correlation = signals.correlation
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     if rejection is not None:
         rejection = _name_deformation(rejection, reference, pyramid)
@@ -592,6 +625,7 @@ def _register(
         rejection,
         moving=moving,
         share=share,
+        contrast=signals.contrast,
         _middle_px=middle.astype(np.float64),
         _origin_px=origin,
     )
@@ -631,12 +665,21 @@ def _reject(failure: MatchFailure, reason: str) -> Registration:
     return Registration(unmeasured_alignment(), float("nan"), Rejection(failure, reason))
 
 
-def _correct_correlation(reference: Reference, variance: float, alignment: Alignment) -> float:
-    """Correlation that the noise-free images would have; ``variance`` is that of the image's noise."""
+@dataclass(frozen=True)
+class _Signals:
+    """Correlation of the images without their noise, and the ratio of their standard deviations."""
+
+    correlation: float
+    contrast: float
+
+
+def _measure_signals(reference: Reference, variance: float, alignment: Alignment) -> _Signals:
+    """What the noise-free images would have in common; ``variance`` is that of the image's noise."""
     passed = passed_variance(reference.levels[-1].sigma_px)
     noise = reference.noise_variance * passed
     image_noise = variance * passed
     whole, image_whole = alignment.reference_variance, alignment.image_variance
     signal = max(whole - noise, _MIN_SIGNAL_SHARE * whole)
     image_signal = max(image_whole - image_noise, _MIN_SIGNAL_SHARE * image_whole)
-    return float(min(alignment.common_covariance / np.sqrt(signal * image_signal), 1.0))
+    correlation = alignment.common_covariance / np.sqrt(signal * image_signal)
+    return _Signals(float(min(correlation, 1.0)), float(np.sqrt(image_signal / signal)))

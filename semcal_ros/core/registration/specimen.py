@@ -102,7 +102,7 @@ def keep_specimen(
     )
     first = information_weights(
         level.normal_matrices[..., :2, :2],
-        float(level.normal_matrices[0, 0, 3, 3]),
+        level.pixel_counts,
         level.sigma_px,
         noise,
     )

@@ -22,7 +22,7 @@ touching the pixels again. What does not depend on the image is computed once pe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
+from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.registration.fractional_delay import (
     FINE,
@@ -40,7 +40,7 @@ from semcal_ros.core.registration.fractional_delay import (
     gradients_transposed,
     sample_tiles,
 )
-from semcal_ros.core.registration.noise_spectrum import gaussian_taps, smooth
+from semcal_ros.core.registration.noise_spectrum import gaussian_taps, passed_variance, smooth
 
 if TYPE_CHECKING:
     from semcal_ros.core.registration.tile_least_squares import TileGeometry
@@ -53,6 +53,7 @@ __all__ = [
     "TileSums",
     "TileWindow",
     "band_of",
+    "drop_pixels",
     "make_level",
     "tile_sums",
     "tile_window",
@@ -98,6 +99,8 @@ class PyramidLevel:
     normal_matrices
         (rows, cols, 4, 4) products of those three and of the constant 1 with each other, summed
         over each tile.
+    dropped
+        (rows, cols, n) True at pixels that do not count (:func:`drop_pixels`); None where all do.
     """
 
     factor: int
@@ -108,6 +111,7 @@ class PyramidLevel:
     mean: float
     products: Image
     normal_matrices: Array
+    dropped: Mask | None = None
     #: Geometry of the latest windows, by their keys.
     geometries: LruCache[tuple[int, int, int, int], TileGeometry] = field(
         default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
@@ -120,6 +124,30 @@ class PyramidLevel:
     def margin(self) -> int:
         """Pixels that the filters reach beyond a tile."""
         return _margin(self.sigma_px)
+
+    @property
+    def pixel_counts(self) -> Array:
+        """(rows, cols) number of pixels of each tile that count, at least 1."""
+        return np.asarray(np.maximum(self.normal_matrices[..., 3, 3], 1.0))
+
+    @cached_property
+    def noise_products(self) -> Array:
+        """(rows, cols, 2, 2) each tile's part in the covariance of the sum over tiles of the products of gradients with
+        white noise of which, after the smoothing, variance one is left.
+
+        Noise n = G w of white noise w, smoothed by G, has the product g' n = (G g)' w with a gradient g.
+        """
+        rows, cols = self.products.shape[:2]
+        side_x, side_y = self.side
+        kept = self.products[:, :, :2]
+        if self.dropped is not None:
+            kept = kept * ~self.dropped[:, :, None, :]
+        planes = kept.reshape(rows, cols, 2, side_y, side_x).transpose(2, 0, 3, 1, 4)
+        planes = planes.reshape(2, rows * side_y, cols * side_x)
+        smoothed = np.stack([smooth(plane, self.sigma_px) for plane in planes])
+        tiles = smoothed.reshape(2, rows, side_y, cols, side_x).transpose(1, 3, 0, 2, 4)
+        tiles = tiles.reshape(rows, cols, 2, -1).astype(np.float64)
+        return np.asarray(tiles @ tiles.transpose(0, 1, 3, 2)) / passed_variance(self.sigma_px)
 
 
 @dataclass(frozen=True)
@@ -246,6 +274,33 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel |
     )
 
 
+def drop_pixels(level: PyramidLevel, dropped: Mask) -> PyramidLevel:
+    """The same resolution without the pixels of the reference where ``dropped`` (h, w), of its size, is True.
+
+    They are no part of any sum then, neither of the reference nor of the image: what lies there does not say where the
+    specimen is.
+    """
+    rows, cols = level.normal_matrices.shape[:2]
+    (left, top), (side_x, side_y) = level.origin, level.side
+    cut = dropped[top : top + rows * side_y, left : left + cols * side_x]
+    tiles = np.ascontiguousarray(
+        cut.reshape(rows, side_y, cols, side_x).transpose(0, 2, 1, 3)
+    ).reshape(rows, cols, -1)
+    some = tiles.any(axis=2)
+    kept = (~tiles[some]).astype(np.float32)
+    with_ones = np.concatenate(
+        [level.products[some] * kept[:, None, :], kept[:, None, :]], axis=1, dtype=np.float32
+    )
+    normal_matrices = level.normal_matrices.copy()
+    normal_matrices[some] = with_ones @ with_ones.transpose(0, 2, 1)
+    return replace(
+        level,
+        normal_matrices=normal_matrices,
+        dropped=tiles,
+        geometries=LruCache(_KEPT_WINDOWS),
+    )
+
+
 class Pyramid:
     """A grey image of any type at the resolutions that are asked for."""
 
@@ -336,6 +391,9 @@ def tile_sums(
     fraction = np.asarray(shift - whole, dtype=np.float64)
     band, smoothing = band_of(level.sigma_px), gaussian_taps(level.sigma_px)
     sampled = sample_tiles(image, corner, count, level.side, fraction, smoothing, band)
+    if level.dropped is not None:
+        sampled[level.dropped[rows, cols].transpose(1, 0, 2)] = 0.0
+        enough = ALL_PIXELS
     if hessian is None and weights is not None:
         hessian = np.einsum("rc,rcij->ij", weights, _tile_hessians(level, window, sampled))
     elif hessian is None:
@@ -361,6 +419,9 @@ def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image, eno
     own = slice(cols.start - curvature.first, cols.stop - curvature.first)
     pixels = sampled[:, curvature.rows].reshape(-1)
     xx, xy, yy = (float(part.reshape(-1) @ pixels) for part in curvature.weights[:, own])
+    if level.dropped is not None:
+        # The sum is of the pixels that count, all of them.
+        return np.array([[xx, xy], [xy, yy]])
     normal_matrices = level.normal_matrices[rows, cols]
     whole = np.array([normal_matrices[..., 0, 0].sum(), normal_matrices[..., 1, 1].sum()])
     share = np.sqrt(whole / np.maximum(curvature.energy[own].sum(axis=0), 1e-30))

@@ -242,6 +242,7 @@ class DriftOutput:
             ("drift_residual", float(measured.residual)),
             ("drift_overlap", float(measured.overlap)),
             ("drift_moving_share", 0.0 if measured.moving is None else measured.moving.share),
+            ("drift_fixed_share", measured.fixed_share),
             ("drift_frames_coasted", self._coasting),
             ("drift_frames_forecast", self._forecast),
         )

@@ -75,7 +75,7 @@ def known(shift: tuple[float, float], gain: float = 1.0, offset: float = 0.0) ->
         converged=True,
         iterations=1,
     )
-    return Registration(alignment, correlation=1.0, rejection=None)
+    return Registration(alignment, correlation=1.0, rejection=None, contrast=gain)
 
 
 def make_picture(shift: tuple[float, float], sigma: float, seed: int) -> NDArray[np.float32]:

@@ -1,0 +1,136 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What stays at its place in the image while the specimen drifts: burnt spots of a detector, dirt, a tool at rest.
+
+It has the noise of the electrons, so that it is not found as what is drawn is (:mod:`.overlay`). Two images between
+which the specimen drifted are compared pixel by pixel, at the same place and at that to which the specimen moved: what
+stays agrees at the first and not at the second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
+
+__all__ = ["LEAST_MOVE_PX", "FixedParts", "find_fixed_parts"]
+
+
+#: Drift from which on two images are compared: less of it hardly changes a picture with details of some pixels.
+LEAST_MOVE_PX = 0.8
+# Side of the squares over which squared differences are summed, px, and by which factor one of the two sums must exceed
+# the other: of 25 independent differences each, once in 10^6 by chance (F distribution). Differences that are smoothed
+# by interpolation are fewer, and 512 x 512 px are many squares; bodies of less than so many pixels do not count.
+_SQUARE_PX, _RATIO, _LEAST_PIXELS = 5, 8.0, 9
+# Differences of grey levels are at least those of rounding.
+_ROUNDING = 1.0 / 6.0
+# Part of the image that may stay: where more does, the shift is not that of the specimen.
+_MOST_STAYS = 0.3
+# By how much what stays is enlarged: its soft edge is told by less than its inside.
+_ENLARGED_PX = 2
+
+
+@dataclass(frozen=True)
+class FixedParts:
+    """What two images show of what stays in place.
+
+    Attributes
+    ----------
+    stays
+        (h, w) True where the images agree at the same place, and not at that to which the specimen moved.
+    moves
+        (h, w) True where they agree at the latter, and not at the former.
+    """
+
+    stays: Mask
+    moves: Mask
+
+
+def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedParts | None:
+    """Find what stays in place between two images of one size, (h, w) or (h, w, 3).
+
+    Parameters
+    ----------
+    before, now
+        The images as they were scanned.
+    shift_px
+        (2,) by how much the specimen moved between them, px.
+
+    Returns
+    -------
+    None where nothing can be told: of different sizes, of a shift below :data:`LEAST_MOVE_PX` or beyond half of the
+    image, or where so much would stay that the shift is in doubt.
+
+    It fails where the specimen repeats by the shift, and on a wrong shift of a specimen that has not moved.
+    """
+    if before.shape != now.shape or np.hypot(*shift_px) < LEAST_MOVE_PX:
+        return None
+    first, second = _to_levels(before), _to_levels(now)
+    height, width = first.shape
+    if np.any(np.abs(shift_px) > 0.5 * np.array([width, height])):
+        return None
+    in_place = _sum_squares(second - first)
+    # What lay at x before is seen at x + shift now: look at both of them from each place.
+    moved = np.full((2, height, width), np.inf, dtype=np.float32)
+    for k, (image, other, sign) in enumerate(((second, first, -1.0), (first, second, 1.0))):
+        x, y = (sign * shift_px).tolist()
+        warp = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        there = cv2.warpAffine(
+            other, warp, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+        covered = cv2.warpAffine(
+            np.ones_like(other),
+            warp,
+            (width, height),
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        )
+        squares = _sum_squares(image - there)
+        inside = (
+            cv2.erode(covered, np.ones((_SQUARE_PX + 4, _SQUARE_PX + 4), np.uint8), borderValue=0)
+            > 0
+        )
+        moved[k][inside] = squares[inside]
+    known = np.isfinite(moved).all(axis=0)
+    stays = known & (moved.min(axis=0) > _RATIO * in_place)
+    moves = known & (in_place > _RATIO * moved.max(axis=0))
+    stays = _keep_bodies(stays)
+    if float(np.mean(stays)) > _MOST_STAYS:
+        return None
+    side = 2 * _ENLARGED_PX + 1
+    enlarged = cv2.dilate(stays.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    return FixedParts(np.asarray(enlarged), np.asarray(moves & ~enlarged))
+
+
+def _to_levels(image: AnyImage) -> Image:
+    gray = image if image.ndim == 2 else image[..., 1]
+    return np.asarray(gray, dtype=np.float32)
+
+
+def _sum_squares(difference: Image) -> Image:
+    size = (_SQUARE_PX, _SQUARE_PX)
+    found = cv2.boxFilter(difference**2, cv2.CV_32F, size, normalize=True)
+    return np.asarray(found + np.float32(_ROUNDING))
+
+
+def _keep_bodies(found: Mask) -> Mask:
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(
+        found.astype(np.uint8), connectivity=8
+    )
+    large = np.flatnonzero(statistics[:, cv2.CC_STAT_AREA] >= _LEAST_PIXELS)
+    return np.asarray(found & np.isin(labels, large))

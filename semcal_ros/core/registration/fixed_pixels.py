@@ -1,0 +1,95 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Registration without the pixels that do not show the specimen in one of two images.
+
+What lies at the same place in all images, such as a data bar, a cross-hair or a burnt spot of the detector, pulls a
+shift to zero, and whatever its place is filled with pulls it, too: by 0.1 px where it is a twentieth of the image.
+These pixels take no part, those of the reference where they are, and those of the image where the shift takes them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.registration.reference import Reference, Region
+from semcal_ros.core.registration.tiles import drop_pixels
+
+__all__ = ["drop_fixed_pixels", "grow_mask"]
+
+
+# Pixels around them into which the filters of gradients and of interpolation smear them, with more than a twentieth of
+# their weight, beyond the smoothing.
+_SMEARED_PX = 2
+# How far the shift at which they are dropped may be from the one that is found.
+_MOVED_PX = 1
+
+
+def grow_mask(mask: Mask, by_px: int) -> Mask:
+    """The mask (h, w) enlarged by so many pixels along each axis."""
+    kernel = np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+
+
+def drop_fixed_pixels(
+    reference: Reference, fixed: Mask | None, region: Region, shift_px: Array
+) -> Reference:
+    """A reference without its own fixed pixels, and without those that an image shows at a shift.
+
+    Parameters
+    ----------
+    reference
+        The reference.
+    fixed
+        (h, w) True at the pixels of the image that do not show the specimen; None where all do.
+    region
+        The part of the image that is compared.
+    shift_px
+        (2,) by how much further right and down the image shows what the reference shows, in px of the whole images.
+
+    Returns
+    -------
+    The reference itself where there is nothing to drop. At coarser resolutions, which only lead to the finest, all
+    pixels count.
+    """
+    if not reference.levels or (fixed is None and reference.fixed is None):
+        return reference
+    level = reference.levels[-1]
+    if level.factor != 1:
+        return reference
+    width, height = level.size
+    dropped = np.zeros((height, width), dtype=bool)
+    reach = _SMEARED_PX + int(np.ceil(level.sigma_px))
+    if reference.fixed is not None:
+        dropped |= grow_mask(reference.fixed, reach)
+    if fixed is not None:
+        left, top, right, bottom = region
+        around = grow_mask(fixed[top:bottom, left:right], reach + _MOVED_PX)
+        origin = np.subtract(region[:2], reference.region[:2])
+        # Where the reference shows what the image shows at its corner.
+        x, y = (int(v) for v in np.rint(origin - np.asarray(shift_px)))
+        across, down = (
+            slice(max(x, 0), max(x + right - left, 0)),
+            slice(max(y, 0), max(y + bottom - top, 0)),
+        )
+        part = dropped[down, across]
+        part |= around[max(-y, 0) :, max(-x, 0) :][: part.shape[0], : part.shape[1]]
+    if not np.any(dropped):
+        return reference
+    levels = (*reference.levels[:-1], drop_pixels(level, dropped))
+    return replace(reference, levels=levels, whole=reference.whole or reference)
