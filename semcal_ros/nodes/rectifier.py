@@ -54,8 +54,9 @@ class RectifierNode(CalibratedStreamNode):
             if g is None:
                 return
             camera = self.camera(frame, g)
-        self.rectifier.rectify(frame.image, camera, out=self.output.memory(frame))
-        self.publish(camera, frame)
+        memory = self.output.memory(frame)
+        self.rectifier.rectify(frame.image, camera, out=memory)
+        self.publish(camera, frame, memory)
 
 
 def main(args: Sequence[str] | None = None) -> int:

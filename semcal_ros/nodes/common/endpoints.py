@@ -129,6 +129,23 @@ class Endpoints:
         self._publishers[topic] = publisher
         return publisher
 
+    def take_in_memory_from(self, source: Node) -> None:
+        """Let the publishers of another node of this process hand their messages over to these subscriptions.
+
+        Those that take serialized bytes stay with the middleware.
+        """
+        publishers = [p for p in source.publishers if isinstance(p, PatientPublisher)]
+        for subscription in self._subscriptions:
+            for publisher in publishers:
+                if subscription.full_topic == publisher.topic_name and not subscription.is_raw:
+                    subscription.receive_in_memory()
+                    publisher.hand_to(subscription)
+
+    @property
+    def waiting(self) -> int:
+        """How many messages wait that were handed over in memory."""
+        return sum(subscription.waiting for subscription in self._subscriptions)
+
     def withdraw(self, topic: str) -> None:
         """Destroy the publisher of a topic, and with it what it keeps for late subscribers."""
         self._node.destroy_publisher(self._publishers.pop(topic))

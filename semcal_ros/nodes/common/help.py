@@ -106,6 +106,13 @@ EXECUTABLES = {
         "~/start, ~/stop",
         "-p goal_x_m:=1e-6 -p start:=true",
     ),
+    "suite": ExecutableHelp(
+        "The suite in one process: source, stream_corrector, parameter_server, viewer, and consumers of others.",
+        "what its nodes do; frames go from node to node in memory",
+        "what its nodes do, images only where somebody subscribes",
+        "those of its nodes",
+        "-p config:=jsm820 -p calibration:=cal.yaml -p source:=folder -p folder:=/mnt/sem",
+    ),
     "bag_player": ExecutableHelp(
         "Replays a recording on its own topics.",
         "a recording, ~/seek, ~/set_rate",
