@@ -153,7 +153,7 @@ class Suite(SemNode):
         # From here on the parts end what they are.
         self.closing.pop_all()
         parts = [Part(node) for node in self._suite_nodes]
-        return parts + [Part(consumer.node, consumer.fail) for consumer in self._consumers]
+        return parts + [consumer.part for consumer in self._consumers]
 
     def _keep(self, node: SemNode) -> None:
         self.closing.callback(node.destroy_node)

@@ -189,17 +189,20 @@ class AdaptiveSubscription:
         """Whether the callback takes the serialized bytes."""
         return self._raw
 
-    def receive_in_memory(self) -> None:
+    def receive_in_memory(self, make_guard: Callable[..., Any]) -> None:
         """Take messages from :meth:`deliver` alone from now on.
 
         As many wait as the quality of service says; the oldest make room for newer ones, and are counted as lost.
+
+        Parameters
+        ----------
+        make_guard
+            :meth:`~semcal_ros.nodes.common.endpoints.Endpoints.guard` of the node.
         """
         self._node.destroy_subscription(self._subscription)
         depth = self.depth
         self._delivered = deque(maxlen=None if math.isinf(depth) else max(1, int(depth)))
-        self._arrived = self._node.create_guard_condition(
-            self._on_delivered, callback_group=self._group
-        )
+        self._arrived = make_guard(self._on_delivered, self._group)
         self._counter.reset()
 
     def deliver(self, message: Any, sent_ns: int, number: int) -> None:

@@ -30,6 +30,7 @@ from semcal_ros.core.camera.calibrated_frame import CalibratedFrame
 from semcal_ros.core.errors import ConfigError, InvalidValueError
 from semcal_ros.core.wording import nearest_name
 from semcal_ros.nodes.common.base import DEFAULT_NAMESPACE
+from semcal_ros.nodes.common.run import Part
 from semcal_ros.nodes.frames.stream import is_late
 
 __all__ = ["CONSUMERS", "SKIPPING_DEPTH", "Consumer", "choose_consumers"]
@@ -80,7 +81,7 @@ def choose_consumers(names: str, installed: Iterable[EntryPoint] | None = None) 
 
 
 class Consumer:
-    """Calls a function of others with each frame, in the executor of a node of its own.
+    """Calls a function of others with each frame, between the callbacks of a node of its own.
 
     The function is that of the entry point; of a class, an instance is made with the node first. What it raises is
     counted and logged, and the next frame comes all the same.
@@ -95,8 +96,8 @@ class Consumer:
 
     Attributes
     ----------
-    node
-        The node, which a class may use for publishers, parameters and timers.
+    node, part
+        The node, which a class may use for publishers, parameters and timers, and what runs it.
     frames, missed, failed
         Frames that it was called with; that were skipped since it is too slow; and on which it, or another callback
         of its node, raised.
@@ -124,7 +125,7 @@ class Consumer:
         self._before_s: float | None = None
         self._interval_s = 0.0
         self._logged: dict[str, float] = {}
-        self._arrived = self.node.create_guard_condition(self._on_arrival)
+        self.part = Part(self.node, self.fail)
 
     def _make(self, entry: EntryPoint) -> Callable[[CalibratedFrame], object]:
         try:
@@ -158,7 +159,7 @@ class Consumer:
         while len(self._waiting) > self._depth:
             self._waiting.popleft()
             self.missed += 1
-        self._arrived.trigger()
+        self.part.post(self._on_arrival)
 
     def _on_arrival(self) -> None:
         if not self._waiting:
@@ -178,7 +179,7 @@ class Consumer:
         except (Exception, SystemExit) as error:  # whatever the code of others may raise
             self.fail(error)
         if self._waiting:
-            self._arrived.trigger()
+            self.part.post(self._on_arrival)
 
     def fail(self, error: BaseException) -> None:
         """Count and log what the code of others raised."""

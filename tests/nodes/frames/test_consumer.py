@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.core.camera.calibrated_frame import CalibratedFrame
@@ -96,12 +95,11 @@ def frame(stamp_ns: int) -> CalibratedFrame:
 
 
 def run(consumer: Consumer, count: int) -> None:
-    executor = SingleThreadedExecutor()
-    executor.add_node(consumer.node)
+    consumer.part.start(lambda: None)
     end_s = time.monotonic() + 10.0
     while consumer.frames + consumer.missed < count and time.monotonic() < end_s:
-        executor.spin_once(timeout_sec=0.1)
-    executor.shutdown()
+        time.sleep(0.01)
+    assert consumer.part.stop()
 
 
 @pytest.mark.parametrize(
