@@ -25,12 +25,15 @@ from launch_ros.actions import Node
 
 def generate_launch_description():
     suite = Path(get_package_share_directory("semcal_ros")) / "launch" / "replay_launch.py"
-    # That file gets the arguments of this one: bag, calibration, config, mode and all others.
+    # It gets the arguments of this file, too; one without a default must be handed on.
+    bag = {"bag": LaunchConfiguration("bag")}
     one_process = EqualsSubstitution(LaunchConfiguration("mode"), "one_process")
     beside = UnlessCondition(one_process)
     return LaunchDescription(
         [
-            IncludeLaunchDescription(PythonLaunchDescriptionSource(str(suite))),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(str(suite)), launch_arguments=bag.items()
+            ),
             Node(package="bead_tracker", executable="bead", output="screen", condition=beside),
         ]
     )
