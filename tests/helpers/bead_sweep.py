@@ -26,12 +26,14 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 
-__all__ = ["SIZE", "magnifications", "truth_nm", "write_sweep"]
+__all__ = ["SIZE", "magnifications", "make_pattern", "picture", "truth_nm", "write_sweep"]
 
 SIZE = 256
 _PERIOD_NS = 200_000_000
 _START_NS = 1_700_000_000_000_000_000
-_SPECIMEN_M = 100e-6  # side of the pattern, which repeats
+# Of the coarsest grains, and the side of their pattern in grains: where the finest one repeats is out of the picture.
+_GRAIN_M = 6e-6
+_PATTERN = 512
 _BEAD_PX = 3.0
 
 
@@ -52,18 +54,29 @@ def _path_m(calibration: Calibration, g: Array) -> Array:
     return out
 
 
-def _picture(calibration: Calibration, g: float, bead_m: Array, pattern: Array) -> np.ndarray:
+def make_pattern() -> Array:
+    """The specimen."""
+    return np.random.default_rng(3).normal(size=(_PATTERN, _PATTERN))
+
+
+def picture(
+    calibration: Calibration,
+    g: float,
+    bead_m: Array,
+    pattern: Array,
+    moved_m: Array | tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
+    """The raw picture of a bead at a place of the sem frame, on a specimen that was moved by ``moved_m``."""
     camera = calibration.at(g).resized(SIZE, SIZE)
     y, x = np.mgrid[0:SIZE, 0:SIZE]
     raw = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
     ideal = camera.undistort(raw) - [camera.px, camera.py]
-    specimen = np.linalg.solve(camera.ideal_from_sem_jacobian, ideal.T).T
+    specimen = np.linalg.solve(camera.ideal_from_sem_jacobian, ideal.T).T - np.asarray(moved_m)
     grey = np.zeros(len(raw))
+    wrapped = np.pad(pattern, ((0, 1), (0, 1)), mode="wrap").astype(np.float32)
     # Grains of all sizes, so that there is something to see at every magnification.
     for octave in range(6):
-        side_px = pattern.shape[0]
-        at = (specimen / _SPECIMEN_M * 2.0**octave * side_px / 4.0) % side_px
-        wrapped = np.pad(pattern, ((0, 1), (0, 1)), mode="wrap").astype(np.float32)
+        at = (specimen / _GRAIN_M * 2.0**octave) % _PATTERN
         column, row = (at[:, k].astype(np.float32).reshape(SIZE, SIZE) for k in (0, 1))
         grey += cv2.remap(wrapped, column, row, cv2.INTER_LINEAR).ravel()
     ideal = camera.ideal_from_sem_jacobian @ bead_m + [camera.px, camera.py]
@@ -75,7 +88,7 @@ def _picture(calibration: Calibration, g: float, bead_m: Array, pattern: Array) 
 
 def write_sweep(path: Path, calibration: Calibration, g: Array) -> None:
     """Write the recording, with one frame for each magnification."""
-    pattern = np.random.default_rng(3).normal(size=(64, 64))
+    pattern = make_pattern()
     with BagWriter(path) as writer:
         for index, (one, bead_m) in enumerate(zip(g, _path_m(calibration, g), strict=True)):
             stamp_ns = _START_NS + index * _PERIOD_NS
@@ -86,7 +99,7 @@ def write_sweep(path: Path, calibration: Calibration, g: Array) -> None:
             frame.header.stamp.sec, frame.header.stamp.nanosec = divmod(stamp_ns, 10**9)
             frame.height = frame.width = frame.step = SIZE
             frame.encoding = "mono8"
-            frame.data = _picture(calibration, one, bead_m, pattern).reshape(-1)
+            frame.data = picture(calibration, one, bead_m, pattern).reshape(-1)
             writer.write("/sem/image_raw", stamp_ns, frame)
 
 
