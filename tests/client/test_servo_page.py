@@ -134,7 +134,7 @@ def test_the_bead_comes_to_the_middle(
         process.close()
     assert status == 0
     assert "Traceback" not in output
-    # Each step leaves 1 - gain * period = 0.6 of the way, so that of 25 px less than a tenth of one remains; the brightest
-    # pixel is known to half a pixel.
+    # Each step leaves 1 - gain * period = 0.6 of the way, so that of 25 px less than a tenth of one remains; the
+    # brightest pixel is known to half a pixel.
     away_px = (bead_m + stage.moved_m - middle_m()) / PIXEL_M
     assert np.max(np.abs(away_px)) < 1.5
