@@ -48,7 +48,7 @@ from benchmarks.table import show
 
 FOLDER = "SEMCAL_LATENCY_FOLDER"
 MODES = ("chain", "suite")
-RATES = {512: 25.0, 2048: 25.0, 4096: 10.0}
+RATES = {512: 25.0, 2048: 25.0, 4096: 4.0}
 WARM_UP_S = 5.0
 # Of the end of a round, in which a frame may still be on its way.
 REST_S = 1.0
