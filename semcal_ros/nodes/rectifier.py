@@ -54,9 +54,8 @@ class RectifierNode(CalibratedStreamNode):
             if g is None:
                 return
             camera = self.camera(frame, g)
-        memory = self.output.memory(frame)
-        self.rectifier.rectify(frame.image, camera, out=memory)
-        self.publish(camera, frame, memory)
+        self.rectifier.rectify(frame.image, camera, out=self.output.memory(frame))
+        self.publish(camera, frame)
 
 
 def main(args: Sequence[str] | None = None) -> int:

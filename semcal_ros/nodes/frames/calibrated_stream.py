@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibrated_frame import (
@@ -129,7 +128,6 @@ class CalibratedStreamNode(StreamNode):
         self,
         camera: ScanCamera | None,
         frame: StreamFrame,
-        image: NDArray[Any],
         drift: FrameDrift | None = None,
     ) -> None:
         """Publish the image in the memory of the output, with its camera if it has one that counts.
@@ -138,8 +136,6 @@ class CalibratedStreamNode(StreamNode):
         ----------
         camera, frame
             Of the image.
-        image
-            The memory of the output.
         drift
             What was taken out of it.
         """
@@ -156,7 +152,7 @@ class CalibratedStreamNode(StreamNode):
         if frame.mixed or (extrapolated and self.parameters["out_of_range"] == "flag"):
             camera = None
         if self._receivers:
-            handed_on = self._calibrated(camera, frame, image, drift)
+            handed_on = self._calibrated(camera, frame, drift)
             for receive in self._receivers:
                 receive(handed_on)
         self.output.publish(camera, frame)
@@ -165,12 +161,11 @@ class CalibratedStreamNode(StreamNode):
         self,
         camera: ScanCamera | None,
         frame: StreamFrame,
-        image: NDArray[Any],
         drift: FrameDrift | None,
     ) -> CalibratedFrame:
         if self._projection is None or self._projection[0] is not camera:
             self._projection = camera, rectified_projection(camera)
-        image = image.view()
+        image = self.output.pixels.view()
         image.setflags(write=False)
         drift_m, covariance = np.zeros(2), np.zeros((2, 2))
         if drift is not None:

@@ -184,7 +184,7 @@ class Consumer:
     def fail(self, error: BaseException) -> None:
         """Count and log what the code of others raised."""
         self.failed += 1
-        self.trouble = f"{type(error).__name__}: {error}"
+        self.trouble = f"{type(error).__name__}: {' '.join(str(error).split())}"
         now_s = time.monotonic()
         if now_s - self._logged.get(self.trouble, -_LOG_AGAIN_S) < _LOG_AGAIN_S:
             return
