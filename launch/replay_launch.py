@@ -116,18 +116,28 @@ def generate_launch_description():
 
 
 def start_nodes(context):
-    nodes = suite.make_nodes(context)
-    player = make_player(context, [node.node_executable for node in nodes])
+    if suite.in_one_process(context):
+        # Nobody is waited for but those in other processes: within one, all have subscribed before the player begins.
+        values = {"source": "bag", **player_parameters(context)}
+        player = suite.make_suite(context, respawn=False, fixed=values)
+        nodes = suite.make_calibration_server(context)
+    else:
+        nodes = suite.make_nodes(context)
+        player = make_player(context, [node.node_executable for node in nodes])
     watch = ReplayWatch(nodes, player)
     return [*watch.handlers(), *nodes, player]
 
 
+def player_parameters(context):
+    values = suite.given(context, ARGUMENTS, PLAYER)
+    return {name: convert(text, TYPES.get(name, str)) for name, text in values.items()}
+
+
 def make_player(context, executables):
-    values = suite.given(context, ARGUMENTS, ["config", *PLAYER])
+    parameters = {**suite.given(context, ARGUMENTS, ["config"]), **player_parameters(context)}
     # What is waited for is not the default of the node.
-    if "wait_for_subscribers" not in values:
-        values["wait_for"] = awaited(executables)
-    parameters = {name: convert(text, TYPES.get(name, str)) for name, text in values.items()}
+    if "wait_for_subscribers" not in parameters:
+        parameters["wait_for"] = awaited(executables)
     return suite.make_node(context, "bag_player", parameters)
 
 

@@ -147,8 +147,18 @@ ARGUMENTS = {
     "mode": Argument(
         "combined",
         "combined: stream_corrector removes drift and distortion in one interpolation."
-        " separate: drift_compensator, then rectifier, for users who need the images in between as well.",
-        choices=["combined", "separate"],
+        " separate: drift_compensator, then rectifier, for users who need the images in between as well."
+        " one_process: suite, in which source, stream_corrector, parameter_server, viewer and consumers hand frames"
+        " over in memory.",
+        choices=["combined", "separate", "one_process"],
+    ),
+    "viewer": Argument(
+        "true", "For mode:=one_process: also show the stream in the browser.", boolean
+    ),
+    "consumers": Argument(
+        "all",
+        "For mode:=one_process: entry points semcal_ros.consumers that get the frames. Names with commas between them,"
+        " all, or none.",
     ),
     "on_mismatch": Argument(
         "warn",
@@ -204,7 +214,7 @@ ARGUMENTS = {
     ),
 }
 # What is no text.
-TYPES = {"monitor_period": float}
+TYPES = {"monitor_period": float, "viewer": lambda text: text == "true"}
 # Not of a replay, whose recording takes the place of the microscope.
 DRIVER = {
     "source": Argument(
@@ -284,7 +294,10 @@ def set_environment(context):
 
 
 def start_nodes(context):
-    nodes = [*make_driver(context), *make_nodes(context)]
+    if in_one_process(context):
+        nodes = [make_suite(context, *DRIVER), *make_calibration_server(context)]
+    else:
+        nodes = [*make_driver(context), *make_nodes(context)]
     return [*NodeWatch(nodes).handlers(), *nodes]
 
 
@@ -304,11 +317,25 @@ def make_nodes(context):
         stabilized = {"input": "stabilized"}
         nodes.append(suite_node(context, "drift_compensator", "config"))
         nodes.append(suite_node(context, "rectifier", *corrector, fixed=stabilized))
-    if LaunchConfiguration("calibration_server").perform(context) == "true":
-        folder = {"directory": folder_of_calibrations(context)}
-        server = ("calibration_server", "config", "calibration", "output", "directory")
-        nodes.append(suite_node(context, *server, fallback=folder))
-    return nodes
+    return [*nodes, *make_calibration_server(context)]
+
+
+def make_calibration_server(context):
+    if LaunchConfiguration("calibration_server").perform(context) != "true":
+        return []
+    folder = {"directory": folder_of_calibrations(context)}
+    server = ("calibration_server", "config", "calibration", "output", "directory")
+    return [suite_node(context, *server, fallback=folder)]
+
+
+def in_one_process(context):
+    return LaunchConfiguration("mode").perform(context) == "one_process"
+
+
+def make_suite(context, *source, fixed=None, **options):
+    """The nodes in one process, which all get the parameters that they have; ``source`` names those of the source."""
+    passed = ("config", "calibration", "on_mismatch", "monitor_period", "viewer", "consumers")
+    return suite_node(context, "suite", *passed, *source, fixed=fixed, name=None, **options)
 
 
 def folder_of_calibrations(context):
@@ -318,7 +345,7 @@ def folder_of_calibrations(context):
     return str(Path.cwd())
 
 
-def suite_node(context, executable, *passed, fixed=None, fallback=None):
+def suite_node(context, executable, *passed, fixed=None, fallback=None, **options):
     """An executable of the suite, which is started again when it dies."""
     respawn = LaunchConfiguration("respawn").perform(context) == "true"
     values = given(context, LIVE, passed)
@@ -326,14 +353,8 @@ def suite_node(context, executable, *passed, fixed=None, fallback=None):
     parameters.update(fixed or {})
     if LaunchConfiguration("use_sim_time").perform(context) == "true":
         parameters["use_sim_time"] = True
-    return make_node(
-        context,
-        executable,
-        parameters,
-        fallback,
-        respawn=respawn,
-        respawn_delay=RESPAWN_DELAY_S,
-    )
+    respawning = {"respawn": respawn, "respawn_delay": RESPAWN_DELAY_S}
+    return make_node(context, executable, parameters, fallback, **{**respawning, **options})
 
 
 def given(context, arguments, names):
@@ -345,10 +366,11 @@ def given(context, arguments, names):
 def make_node(context, executable, parameters, fallback=None, **options):
     """``parameters`` win over params_file, which wins over ``fallback``."""
     params_file = LaunchConfiguration("params_file").perform(context)
+    # Several nodes in one process keep their names, and get the parameters of a section for all nodes.
+    options.setdefault("name", executable)
     return Node(
         package=PACKAGE,
         executable=executable,
-        name=executable,
         namespace=LaunchConfiguration("namespace").perform(context),
         parameters=[
             *([typed(fallback)] if fallback else []),

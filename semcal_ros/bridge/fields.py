@@ -74,7 +74,8 @@ def byte_memory(message: Any, name: str, size: int) -> NDArray[np.uint8]:
         setattr(message, name, new)
         return new
     if not (isinstance(old, array.array) and old.typecode == "B" and len(old) == size):
-        setattr(message, name, array.array("B", bytes(size)))
+        # Half the time of array("B", bytes(size)), which fills the memory twice.
+        setattr(message, name, array.array("B", b"\0") * size)
         # rclpy may have taken a copy.
         old = getattr(message, name)
     return np.frombuffer(old, dtype=np.uint8) if size else np.empty(0, np.uint8)

@@ -23,8 +23,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from semcal_ros.client.frame import CalibratedFrame, Positions
 from semcal_ros.client.recording import open_frames
+from semcal_ros.core.camera.calibrated_frame import CalibratedFrame, Positions
 
 if TYPE_CHECKING:
     from semcal_ros.client.stream import CalibratedStream

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from semcal_ros.client.frame import CalibratedFrame
+from semcal_ros.core.camera.calibrated_frame import CalibratedFrame, rectified_projection
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.workflows.follow_drift import DriftFollower, camera_for, start_time_s
@@ -85,19 +85,11 @@ def open_frames(
                 image,
                 frame.stamp_ns,
                 frame.magnification,
-                *_projection(camera),
+                *rectified_projection(camera),
                 drift_m,
                 covariance,
                 _explain(camera, calibrated=model is not None),
             )
-
-
-def _projection(camera: ScanCamera) -> tuple[np.ndarray, np.ndarray]:
-    rectified = camera.rectified
-    covariance = (
-        np.zeros((12, 12)) if rectified.covariance is None else rectified.P_affine_covariance
-    )
-    return rectified.P_affine, covariance
 
 
 def _explain(camera: ScanCamera, *, calibrated: bool) -> str:

@@ -29,9 +29,9 @@ from semcal_ros.bridge.projection import (
     stamped_projection_covariance_from_message,
     stamped_projection_from_message,
 )
-from semcal_ros.client.frame import CalibratedFrame
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.camera.calibrated_frame import CalibratedFrame, describe_missing_camera
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
@@ -189,12 +189,6 @@ def _read_drift(message: PoseWithCovarianceStamped) -> tuple[Array, Array]:
 
 def _explain(frame: StreamFrame, projection: Array) -> str:
     """Say why lengths of a frame mean nothing; empty where they do."""
-    if frame.mixed:
-        return "the magnification changed while it was scanned"
-    if projection[0, 0] > 0.0:
+    if projection[0, 0] > 0.0 and not frame.mixed:
         return ""
-    if frame.magnification is None:
-        return "no camera: its magnification is not known"
-    return (
-        f"no camera at magnification {frame.magnification:g}: no calibration, or outside its range"
-    )
+    return describe_missing_camera(frame.magnification, mixed=frame.mixed)

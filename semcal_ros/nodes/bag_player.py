@@ -187,8 +187,11 @@ class BagPlayer(SemNode):
         self._make_controls()
         self._announce()
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
-        self._thread.start()
         self.closing.callback(self._end_replay)
+
+    def begin(self) -> None:
+        """Override the base class: the replay begins."""
+        self._thread.start()
 
     def idle(self) -> bool:
         """Return True: a replay receives no frames."""
@@ -202,7 +205,8 @@ class BagPlayer(SemNode):
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-        self._thread.join(timeout=_END_S)
+        if self._thread.is_alive():
+            self._thread.join(timeout=_END_S)
 
     # -- topics ------------------------------------------------------------------------------------
 

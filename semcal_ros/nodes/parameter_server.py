@@ -42,6 +42,7 @@ from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.static_frames import StaticFramesOutput
 
 if TYPE_CHECKING:
     from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
@@ -95,6 +96,7 @@ class ParameterServer(SemNode):
         self._covariance = self.endpoints.latched_publisher(
             Float64MultiArray, "projection_covariance"
         )
+        self._frames = StaticFramesOutput(self.config, self.endpoints, self.get_clock())
         self._calibration = CalibrationInput(
             self.config,
             self.parameters,
@@ -207,6 +209,7 @@ class ParameterServer(SemNode):
             fill_projection_covariance(covariance, camera)
             self._covariance.publish(covariance)
         self._projection.publish(projection)
+        self._frames.publish(camera)
         self.reporter.count_published(None)
         self._share_camera()
         if self._info is not None:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The node ``microscope`` with a source of your own."""
+"""The node ``microscope``, alone or in the suite, with a source of your own."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from collections.abc import Callable, Sequence
 
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.drivers.source import FrameSource
-from semcal_ros.nodes.common.run import run_node
+from semcal_ros.nodes.common.run import run_node, run_parts
 from semcal_ros.nodes.microscope import Microscope
+from semcal_ros.nodes.suite import Suite
 
-__all__ = ["run_source"]
+__all__ = ["run_source", "run_suite"]
 
 
 def run_source(
@@ -43,3 +44,10 @@ def run_source(
     Exit status.
     """
     return run_node(lambda: Microscope(make), args)
+
+
+def run_suite(
+    make: Callable[[MicroscopeConfig], FrameSource], args: Sequence[str] | None = None
+) -> int:
+    """Run the executable ``suite`` with this source; parameters and result are those of :func:`run_source`."""
+    return run_parts(lambda: Suite.with_parts(make), args)

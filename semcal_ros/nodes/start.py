@@ -29,6 +29,7 @@ __all__ = [
     "parameter_server",
     "rectifier",
     "stream_corrector",
+    "suite",
     "virtual_sem",
     "visual_servo",
 ]
@@ -53,5 +54,6 @@ microscope = _starter("microscope")
 parameter_server = _starter("parameter_server")
 rectifier = _starter("rectifier")
 stream_corrector = _starter("stream_corrector")
+suite = _starter("suite")
 virtual_sem = _starter("virtual_sem")
 visual_servo = _starter("visual_servo")

@@ -55,7 +55,7 @@ class StreamCorrector(CalibratedStreamNode):
         raster = None if drift is None else drift.raster
         memory = self.output.memory(frame)
         self.rectifier.rectify(frame.image, used, raster, self.config.scan, out=memory)
-        self.publish(camera, frame)
+        self.publish(camera, frame, drift)
         if drift is not None:
             self._drifts.publish(drift, frame)
 

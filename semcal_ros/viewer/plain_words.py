@@ -33,7 +33,7 @@ _ORDER = (_ERROR, _WARN, _OK)
 # A node reports every second by default, and up to once a minute; this one has ended or hangs.
 _SILENT_S = 5.0
 # Their diagnostics have a rate, but not of frames.
-_WITHOUT_FRAMES = ("calibration_server", "parameter_server")
+_WITHOUT_FRAMES = ("calibration_server", "parameter_server", "suite")
 
 # What a node says -> level, words (with the groups of the expression), what to do. The first that fits counts.
 # `tests/viewer/test_words.py` finds all states in the code of the nodes, and wants a sentence for each.
@@ -156,6 +156,12 @@ _SENTENCES: tuple[tuple[str, str, str, str], ...] = (
         "it goes on by itself once that is over; a fault needs ~/start",
     ),
     (r"paused", _WARN, "is paused", "press Start"),
+    (
+        r"consumer (\S+) raised (.*)",
+        _WARN,
+        r"runs the consumer \1, which raised \2",
+        "correct it; the log has the traceback, and the stream goes on",
+    ),
     (r"stopped", _WARN, "is stopped", "press Start"),
     (
         r"source lost, trying again: (.*)",

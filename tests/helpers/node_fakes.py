@@ -37,6 +37,7 @@ class FakeSubscription:
         self.renewals = 0
         self.asked_again = 0
         self.rivals = ""
+        self.in_memory = False
         self.names: list[str] = []
         self.waiting: deque[tuple[Any, Any]] = deque()
 

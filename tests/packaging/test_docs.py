@@ -148,7 +148,7 @@ def test_the_nodes_are_those_of_the_package() -> None:
     table = re.findall(r"^\| \[`(\w+)`\]\(#\w+\)", text, re.MULTILINE)
     sections = [h for h in re.findall(r"^## (\w+)$", text, re.MULTILINE) if "_" in h or h in NODES]
     run = re.findall(r"ros2 run semcal_ros (\w+)", "".join(p.read_text("utf-8") for p in PAGES))
-    assert len(NODES) == 9
+    assert len(NODES) == 10
     assert sorted(table) == sorted(sections) == sorted(NODES)
     assert set(run) <= set(NODES)
 

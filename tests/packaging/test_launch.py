@@ -314,12 +314,20 @@ def _settings(executable: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any
     with monkeypatch.context() as patch:
         patch.setattr(base.Node, "__init__", lambda *_args, **_options: None)
         patch.setattr(base, "Parameters", record)
-        patch.setattr(module, "run_node", lambda factory, _args=None, threads=1: factory())
+        runner = "run_parts" if executable == "suite" else "run_node"
+        patch.setattr(module, runner, lambda factory, _args=None, threads=1: factory())
         with pytest.raises(_Declared):
             module.main([])
     return found
 
 
+IN_SUITE = (
+    "suite",
+    "stream_corrector",
+    "parameter_server",
+    "microscope",
+    "bag_player",
+)
 EVERYTHING = {
     "namespace": "/lab/sem",
     "config": "jsm820",
@@ -331,6 +339,8 @@ EVERYTHING = {
     "log_level": "debug",
     "on_mismatch": "refuse",
     "monitor_period": "60",
+    "viewer": "false",
+    "consumers": "bead",
 }
 DRIVER = {"source": "folder", "folder": "."}
 REPLAY_EVERYTHING = {
@@ -347,7 +357,8 @@ REPLAY_EVERYTHING = {
 CASES = [
     (path, mode, arguments)
     for (path, few, many), mode in itertools.product(
-        [(SUITE, {}, EVERYTHING), (REPLAY, BAG, REPLAY_EVERYTHING)], ["combined", "separate"]
+        [(SUITE, {}, EVERYTHING), (REPLAY, BAG, REPLAY_EVERYTHING)],
+        ["combined", "separate", "one_process"],
     )
     for arguments in (few, many)
 ]
@@ -362,9 +373,12 @@ def test_every_executable_and_parameter_exists(
     assert context.nodes
     for node in context.nodes:
         assert node.package == "semcal_ros"
-        assert node.name == node.executable
+        assert node.name == (None if node.executable == "suite" else node.executable)
         assert (folder / node.executable).is_file()
-        settings = _settings(node.executable, monkeypatch)
+        settings = {}
+        for part in IN_SUITE if node.executable == "suite" else (node.executable,):
+            # As in the process: the source that the suite is given names no source of the microscope.
+            settings |= {k: v for k, v in _settings(part, monkeypatch).items() if k not in settings}
         for name, value in node.parameters.items():
             if name == "use_sim_time":  # every ROS node has it
                 assert value is True
@@ -385,6 +399,11 @@ def test_every_executable_and_parameter_exists(
             {"calibration_server": "true"},
             ["parameter_server", "stream_corrector", "calibration_server"],
         ),
+        ({"mode": "one_process"}, ["suite"]),
+        (
+            {"mode": "one_process", "calibration_server": "true"},
+            ["suite", "calibration_server"],
+        ),
     ],
 )
 def test_the_suite_starts(run: Run, arguments: dict[str, str], wanted: list[str]) -> None:
@@ -397,8 +416,24 @@ def test_the_rectifier_takes_what_the_compensator_makes(run: Run) -> None:
     assert run(SUITE, {"mode": "separate"}).node("rectifier").parameters == {"input": "stabilized"}
 
 
+@pytest.mark.parametrize(
+    ("path", "arguments", "source"),
+    [(SUITE, {}, None), (SUITE, DRIVER, "folder"), (REPLAY, BAG, "bag")],
+)
+def test_one_process_has_the_source_too(
+    run: Run, path: Path, arguments: dict[str, str], source: str | None
+) -> None:
+    (node,) = run(path, {**arguments, "mode": "one_process", "viewer": "false"}).nodes
+    assert node.parameters["viewer"] is False
+    assert node.parameters.get("source") == source
+    assert node.parameters.get("folder") == arguments.get("folder")
+    assert node.parameters.get("bag") == arguments.get("bag")
+    # It must not play a recording again.
+    assert node.respawn is (path == SUITE)
+
+
 def test_arguments_reach_every_node(run: Run) -> None:
-    for mode in ("combined", "separate"):
+    for mode in ("combined", "separate", "one_process"):
         context = run(SUITE, {**EVERYTHING, "mode": mode})
         for node in context.nodes:
             assert node.namespace == "/lab/sem"
@@ -453,6 +488,7 @@ WRONG = [
     (SUITE, "params_file", "missing.yaml"),
     (SUITE, "folder", "missing"),
     (SUITE, "use_sim_time", "ja"),
+    (SUITE, "viewer", "ja"),
     (SUITE, "respawn", "ja"),
     (SUITE, "large_images", "ja"),
     (REPLAY, "params_file", "missing.yaml"),
@@ -484,7 +520,9 @@ def test_every_argument_is_checked(run: Run, path: Path) -> None:
     """Those without a choice must be in the list above, but for names of topics, which anything may be."""
     arguments = run(path, BAG if path == REPLAY else {}).arguments
     free = {name for name, action in arguments.items() if action.options["choices"] is None}
-    assert free - {name for _, name, _ in WRONG} == ({"topics", "exclude"} & set(arguments))
+    assert free - {name for _, name, _ in WRONG} == (
+        {"topics", "exclude", "consumers"} & set(arguments)
+    )
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,7 @@ STATES = {
     ),
     "standing still: no frames": ("warn", "no frames", "it goes on by itself"),
     "paused": ("warn", "paused", "press Start"),
+    "consumer bead raised OSError: no stage": ("warn", "bead, which raised OSError", "correct it"),
     "stopped": ("warn", "stopped", "press Start"),
     "source lost, trying again: no route": ("error", "lost the microscope", "look whether"),
     "connecting for 7 s": ("warn", "7 s", "if it goes on"),

@@ -96,7 +96,7 @@ class SemNode(Node):
         self.config = load_config(self.parameters["config"])
         self.endpoints = Endpoints(self)
         self.reporter = Reporter(self.get_logger(), self.get_clock())
-        if unused:
+        if unused and not command_line().of_several:
             self.reporter.warn(f"not parameters of this node, and ignored: {', '.join(unused)}")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._report_timer = self.create_timer(
@@ -122,12 +122,16 @@ class SemNode(Node):
         """Say in one line of the log what the finished node is, and where it listens and speaks; warn of names that
         were to be changed and that it does not use.
         """
-        if unused := self._unused_renamings():
+        unused = self._unused_renamings()
+        if unused and not command_line().of_several:
             self.reporter.warn(
                 f"not topics or services of this node, and not renamed: {', '.join(unused)}"
             )
         topics = self.endpoints.describe_topics()
         self.reporter.info("; ".join([*self.introduction(), *filter(None, [topics])]))
+
+    def begin(self) -> None:
+        """Begin what does not wait for the executor, once the node has been accepted."""
 
     # -- parameters --------------------------------------------------------------------------------
 
@@ -151,6 +155,10 @@ class SemNode(Node):
                 near = nearest_name(name, known)
                 unused.append(f"{name} ({near}, perhaps)" if near else name)
         return unused
+
+    def unknown_parameters(self) -> set[str]:
+        """Return given parameters that the finished node does not have, topics' qualities included."""
+        return {*self._unused_parameters(of_topics=False), *self._unused_parameters(of_topics=True)}
 
     def refuse_unknown_topics(self) -> None:
         """Refuse ``qos_overrides`` of topics that the finished node does not have.

@@ -32,6 +32,7 @@ __all__ = [
     "command_line",
     "is_quality",
     "starting_with",
+    "unknown_parameter",
 ]
 
 _HELP = ("-h", "--help")
@@ -57,9 +58,12 @@ class CommandLine:
     ----------
     arguments
         Without the name of the executable.
+    of_several
+        Whether they are of several nodes in one process: what one does not know another may.
     """
 
     arguments: tuple[str, ...] = ()
+    of_several: bool = False
 
     @property
     def wants_help(self) -> bool:
@@ -116,13 +120,8 @@ class CommandLine:
         for_all = frozenset[str]().union(*(s.names for s in sections if "*" in s.nodes))
         unknown = [key for key in given if key not in known and key not in _OF_ROS]
         for key in unknown:
-            if key not in for_all:
-                near = nearest_name(key, known)
-                raise InvalidValueError(
-                    f"parameter {key}, which {name} does not have",
-                    expected=f"{near}, perhaps" if near else "one of its parameters",
-                    do="see --help, or `ros2 param list` while it runs",
-                )
+            if key not in for_all and not self.of_several:
+                raise unknown_parameter(key, name, known)
         return unknown
 
     def renamed_topics(self, node: str) -> list[str]:
@@ -142,6 +141,16 @@ class CommandLine:
         pairs = zip(self.arguments, self.arguments[1:], strict=False)
         files = [value for flag, value in pairs if flag == "--params-file"]
         return [section for file in files for section in _read_sections(file)]
+
+
+def unknown_parameter(key: str, owner: str, known: Iterable[str]) -> InvalidValueError:
+    """Return the error for a parameter that a node, or all nodes of a process, do not have."""
+    near = nearest_name(key, list(known))
+    return InvalidValueError(
+        f"parameter {key}, which {owner} does not have",
+        expected=f"{near}, perhaps" if near else "one of its parameters",
+        do="see --help, or `ros2 param list` while it runs",
+    )
 
 
 def _read_sections(file: str) -> tuple[ParameterSection, ...]:
@@ -164,9 +173,9 @@ def command_line() -> CommandLine:
 
 
 @contextmanager
-def starting_with(arguments: Sequence[str]) -> Iterator[CommandLine]:
+def starting_with(arguments: Sequence[str], *, of_several: bool = False) -> Iterator[CommandLine]:
     """Make these the arguments of the executable that is started inside."""
-    line = CommandLine(tuple(arguments))
+    line = CommandLine(tuple(arguments), of_several)
     token = _CURRENT.set(line)
     try:
         yield line

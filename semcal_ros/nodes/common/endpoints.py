@@ -20,7 +20,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
@@ -36,7 +35,37 @@ from semcal_ros.nodes.common.qos import (
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, MessageInfo
 
-__all__ = ["Endpoints"]
+__all__ = ["Endpoints", "Guard"]
+
+Post = Callable[[Callable[[], None]], None]
+
+
+class Guard:
+    """A condition that any thread may trigger; the node's executor runs its callback.
+
+    Parameters
+    ----------
+    node
+        The node.
+    callback
+        What is run.
+    group
+        Its callback group.
+    """
+
+    def __init__(
+        self, node: Node, callback: Callable[[], None], group: CallbackGroup | None = None
+    ) -> None:
+        self._callback = callback
+        self._condition = node.create_guard_condition(callback, callback_group=group)
+        self.post: Post | None = None
+
+    def trigger(self) -> None:
+        """Let the callback run soon."""
+        if self.post is None:
+            self._condition.trigger()
+        else:
+            self.post(self._callback)
 
 
 class Endpoints:
@@ -52,6 +81,8 @@ class Endpoints:
         self._node = node
         self._subscriptions: list[AdaptiveSubscription] = []
         self._publishers: dict[str, Any] = {}
+        self._guards: list[Guard] = []
+        self._post: Post | None = None
 
     def subscribe(
         self,
@@ -129,13 +160,39 @@ class Endpoints:
         self._publishers[topic] = publisher
         return publisher
 
+    def take_in_memory_from(self, source: Node) -> None:
+        """Let the publishers of another node of this process hand their messages over to these subscriptions.
+
+        Those that take serialized bytes stay with the middleware.
+        """
+        publishers = [p for p in source.publishers if isinstance(p, PatientPublisher)]
+        for subscription in self._subscriptions:
+            for publisher in publishers:
+                if subscription.full_topic == publisher.topic_name and not subscription.is_raw:
+                    subscription.receive_in_memory(self.guard)
+                    publisher.hand_to(subscription)
+
+    @property
+    def waiting(self) -> int:
+        """How many messages wait that were handed over in memory."""
+        return sum(subscription.waiting for subscription in self._subscriptions)
+
     def withdraw(self, topic: str) -> None:
         """Destroy the publisher of a topic, and with it what it keeps for late subscribers."""
         self._node.destroy_publisher(self._publishers.pop(topic))
 
-    def guard(self, callback: Callable[[], None]) -> GuardCondition:
+    def guard(self, callback: Callable[[], None], group: CallbackGroup | None = None) -> Guard:
         """Create a condition that any thread may trigger; the node's executor runs its callback."""
-        return self._node.create_guard_condition(callback)
+        guard = Guard(self._node, callback, group)
+        guard.post = self._post
+        self._guards.append(guard)
+        return guard
+
+    def run_guards_by(self, post: Post) -> None:
+        """Let ``post`` run the callbacks of all conditions, one at a time and never beside others of the node."""
+        self._post = post
+        for guard in self._guards:
+            guard.post = post
 
     def trigger_service(
         self,

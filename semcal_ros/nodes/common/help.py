@@ -73,7 +73,8 @@ EXECUTABLES = {
     "parameter_server": ExecutableHelp(
         "Serves the calibration at any magnification, on topics and as parameters.",
         "magnification, calibration, conditions; image_raw with monitor_period",
-        "calibration, camera_info, projection, projection_covariance; parameters such as `p@5250`",
+        "calibration, camera_info, projection, projection_covariance, /tf_static where tf2 is installed; parameters"
+        " such as `p@5250`",
         "~/reload",
         "-p config:=jsm820 -p calibration:=cal.yaml",
     ),
@@ -105,6 +106,14 @@ EXECUTABLES = {
         "velocity of the stage, ~/error",
         "~/start, ~/stop",
         "-p goal_x_m:=1e-6 -p start:=true",
+    ),
+    "suite": ExecutableHelp(
+        "The suite in one process, with the parameters of all its nodes: source, stream_corrector, parameter_server,"
+        " viewer, and consumers of others.",
+        "what its nodes do; frames go from node to node in memory",
+        "what its nodes do, images only where somebody subscribes",
+        "those of its nodes",
+        "-p config:=jsm820 -p source:=openfibsem -p consumers:=none",
     ),
     "bag_player": ExecutableHelp(
         "Replays a recording on its own topics.",

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -94,7 +95,8 @@ class MessageCounter:
 class AdaptiveSubscription:
     """Subscribes as requested, then with fewer demands after an incompatible-QoS event: else nothing would arrive.
 
-    When the last publisher is gone, :meth:`check_publishers` returns to the requested quality.
+    When the last publisher is gone, :meth:`check_publishers` returns to the requested quality. A publisher of the same
+    process may hand its messages over :meth:`in memory <receive_in_memory>` instead.
 
     Parameters
     ----------
@@ -150,6 +152,9 @@ class AdaptiveSubscription:
         self._publishers = 0
         self._keeps_last = bool(source) and not streams
         self._asking: Any = None
+        # What was handed over in memory and not taken yet, once it is.
+        self._delivered: deque[tuple[Any, MessageInfo]] | None = None
+        self._arrived: Any = None
         self._watch: SourceWatch | None = None
         if source:
             now_s = time.monotonic()
@@ -166,6 +171,68 @@ class AdaptiveSubscription:
         if self._paused:
             self._paused = False
             self._subscription = self._subscribe()
+
+    # -- in memory ---------------------------------------------------------------------------------
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether a publisher of the same process hands its messages over."""
+        return self._delivered is not None
+
+    @property
+    def waiting(self) -> int:
+        """How many messages that were handed over in memory have not been taken yet."""
+        return len(self._delivered or ())
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether the callback takes the serialized bytes."""
+        return self._raw
+
+    def receive_in_memory(self, make_guard: Callable[..., Any]) -> None:
+        """Take messages from :meth:`deliver` alone from now on.
+
+        As many wait as the quality of service says; the oldest make room for newer ones, and are counted as lost.
+
+        Parameters
+        ----------
+        make_guard
+            :meth:`~semcal_ros.nodes.common.endpoints.Endpoints.guard` of the node.
+        """
+        self._node.destroy_subscription(self._subscription)
+        depth = self.depth
+        self._delivered = deque(maxlen=None if math.isinf(depth) else max(1, int(depth)))
+        self._arrived = make_guard(self._on_delivered, self._group)
+        self._counter.reset()
+
+    def deliver(self, message: Any, sent_ns: int, number: int) -> None:
+        """Take a message from a publisher of the same process, in any thread; the node's executor calls back.
+
+        Parameters
+        ----------
+        message
+            Nobody may change it any more.
+        sent_ns
+            When it was published, ns.
+        number
+            Its number among those of its publisher.
+        """
+        assert self._delivered is not None
+        info = {
+            "source_timestamp": sent_ns,
+            "received_timestamp": sent_ns,
+            "publication_sequence_number": number,
+        }
+        self._delivered.append((message, info))
+        self._arrived.trigger()
+
+    def _on_delivered(self) -> None:
+        taken = self.take()
+        if taken is not None:
+            self._callback(*taken)
+        # One message per turn of the executor, as from the middleware.
+        if self._delivered:
+            self._arrived.trigger()
 
     @property
     def downgraded(self) -> str:
@@ -216,7 +283,8 @@ class AdaptiveSubscription:
     def _count(self, info: MessageInfo) -> None:
         self._received += 1
         number = info.get("publication_sequence_number")
-        self._publishers = self._subscription.get_publisher_count()
+        # In memory there is one, whatever else is found on the topic.
+        self._publishers = 1 if self.in_memory else self._subscription.get_publisher_count()
         self._counter.count(number, self._publishers)
 
     def take_waiting(self) -> None:
@@ -230,16 +298,21 @@ class AdaptiveSubscription:
 
     def take(self) -> tuple[Any, MessageInfo] | None:
         """Return the next message that has already arrived, with its information, or None."""
-        if self._paused:
-            return None
-        handle = self._subscription.handle
-        with handle:
-            taken = handle.take_message(self._type, self._raw)
+        taken = self._next()
         if taken is None:
             return None
         message, info = taken
         self._count(info)
         return message, info
+
+    def _next(self) -> Any:
+        if self._delivered is not None:
+            return self._delivered.popleft() if self._delivered else None
+        if self._paused:
+            return None
+        handle = self._subscription.handle
+        with handle:
+            return handle.take_message(self._type, self._raw)
 
     def ask_again(self) -> None:
         """Ask, at the next check, publishers that keep their last message to send it once more.
@@ -287,7 +360,9 @@ class AdaptiveSubscription:
                 " configuration or the publisher"
             )
         self._foreign_types = foreign
-        if self._profile is not self._requested and not publishers:
+        if self.in_memory:
+            pass
+        elif self._profile is not self._requested and not publishers:
             self._node.destroy_subscription(self._subscription)
             self._profile = self._requested
             self._subscription = self._subscribe()

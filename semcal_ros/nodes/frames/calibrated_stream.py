@@ -17,8 +17,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.camera.calibrated_frame import (
+    CalibratedFrame,
+    describe_missing_camera,
+    rectified_projection,
+)
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.common.parameters import (
@@ -33,6 +41,9 @@ from semcal_ros.nodes.frames.compressed import compressed_parameters
 from semcal_ros.nodes.frames.conditions import ON_MISMATCH, ConditionsWatch
 from semcal_ros.nodes.frames.outputs import RectifiedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
+
+if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node without drift does not
+    from semcal_ros.nodes.frames.live_drift import FrameDrift
 
 __all__ = ["CalibratedStreamNode"]
 
@@ -84,6 +95,8 @@ class CalibratedStreamNode(StreamNode):
         self._refused = 0
         # Only the latest: most frames have the magnification of the frame before.
         self._camera: tuple[object, tuple[float, int, int], ScanCamera | None] | None = None
+        self._receivers: list[Callable[[CalibratedFrame], None]] = []
+        self._projection: tuple[ScanCamera | None, tuple[Array, Array]] | None = None
 
     def on_calibration(self) -> None:
         """React to a new calibration in force; not called for the calibration given at start."""
@@ -106,8 +119,26 @@ class CalibratedStreamNode(StreamNode):
         self._range.check(current, camera, magnification)
         return camera
 
-    def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
-        """Publish the image in the memory of the output, with its camera if it has one that counts."""
+    def hand_to(self, receive: Callable[[CalibratedFrame], None]) -> None:
+        """Call ``receive`` with each frame that is published, in the thread of this node, before others get it."""
+        self._receivers.append(receive)
+        self.output.give_memory_away()
+
+    def publish(
+        self,
+        camera: ScanCamera | None,
+        frame: StreamFrame,
+        drift: FrameDrift | None = None,
+    ) -> None:
+        """Publish the image in the memory of the output, with its camera if it has one that counts.
+
+        Parameters
+        ----------
+        camera, frame
+            Of the image.
+        drift
+            What was taken out of it.
+        """
         if self.calibration.current is None and self.parameters["uncalibrated"] == "drop":
             self._dropped += 1
             self.reporter.note("frames_uncalibrated", self._dropped)
@@ -120,7 +151,35 @@ class CalibratedStreamNode(StreamNode):
         extrapolated = camera is not None and not camera.in_range
         if frame.mixed or (extrapolated and self.parameters["out_of_range"] == "flag"):
             camera = None
+        if self._receivers:
+            handed_on = self._calibrated(camera, frame, drift)
+            for receive in self._receivers:
+                receive(handed_on)
         self.output.publish(camera, frame)
+
+    def _calibrated(
+        self,
+        camera: ScanCamera | None,
+        frame: StreamFrame,
+        drift: FrameDrift | None,
+    ) -> CalibratedFrame:
+        if self._projection is None or self._projection[0] is not camera:
+            self._projection = camera, rectified_projection(camera)
+        image = self.output.pixels.view()
+        image.setflags(write=False)
+        drift_m, covariance = np.zeros(2), np.zeros((2, 2))
+        if drift is not None:
+            drift_m, covariance = drift.estimate.drift_m, drift.estimate.covariance[:2, :2]
+        has_camera = camera is not None
+        return CalibratedFrame(
+            image,
+            frame.stamp_ns,
+            frame.magnification,
+            *self._projection[1],
+            drift_m,
+            covariance,
+            "" if has_camera else describe_missing_camera(frame.magnification, mixed=frame.mixed),
+        )
 
     def introduction(self) -> list[str]:
         """Extend the base class: also the calibration."""

@@ -52,6 +52,13 @@ class ImageOutput:
     """Publishes images on one topic, from memory that is reused for each image, and compressed copies beside it.
 
     The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
+
+    Attributes
+    ----------
+    pixels
+        The memory of the last image.
+    reuses_memory
+        Whether it is; not where the pixels are handed over to others of this process.
     """
 
     def __init__(
@@ -61,18 +68,22 @@ class ImageOutput:
         self._message = Image()
         self._publisher = endpoints.stream_publisher(Image, topic)
         self._compressed = CompressedOutput(parameters, endpoints, reporter, topic)
-        self._pixels: NDArray[Any] = np.empty(0)
+        self.pixels: NDArray[Any] = np.empty(0)
+        self.reuses_memory = True
 
     def memory(self, frame: StreamFrame) -> NDArray[Any]:
         """Return the memory for the pixels of the image made from ``frame``."""
-        self._pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
-        return self._pixels
+        if not self.reuses_memory:
+            self._message = Image()
+        self.pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
+        return self.pixels
 
     def publish(self, frame: StreamFrame) -> None:
         """Publish the image in the memory."""
-        self._publisher.publish(self._message)
+        if self._publisher.is_awaited:
+            self._publisher.publish(self._message)
         self._reporter.count_published(frame.stamp_ns)
-        self._compressed.publish(self._pixels, frame)
+        self._compressed.publish(self.pixels, frame)
 
     def close(self) -> None:
         """Wait for the compressing thread; call it before the node is destroyed."""
@@ -170,6 +181,15 @@ class RectifiedOutput:
     def close(self) -> None:
         """As :meth:`ImageOutput.close`."""
         self._image.close()
+
+    @property
+    def pixels(self) -> NDArray[Any]:
+        """The memory of the last image."""
+        return self._image.pixels
+
+    def give_memory_away(self) -> None:
+        """Take new memory for each image from now on; others of this process keep it."""
+        self._image.reuses_memory = False
 
     def publish(self, camera: ScanCamera | None, frame: StreamFrame) -> None:
         """Publish the rectified image; ``camera`` is None if the image has no camera."""

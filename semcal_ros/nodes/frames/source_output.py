@@ -154,6 +154,8 @@ class SourceOutput:
         stamp_ns = frame.start_ns + round(passed * (acquisition_s or 0.0) * 1e9)
         header = Header()
         fill_header(header, stamp_ns, self._config.frame_id)
+        if self._images.hands_over:
+            self._image = Image()
         fill_image(self._image, frame.image, encoding, header)
         self._images.publish(self._image)
         return stamp_ns

@@ -338,7 +338,7 @@ class FrameInput:
 
     def _check_transport(self, image_bytes: int) -> None:
         """Check whether this process is set up for images of this size."""
-        if image_bytes != self._image_bytes:
+        if image_bytes != self._image_bytes and not self._images.in_memory:
             self._image_bytes = image_bytes
             rmw = get_rmw_implementation_identifier()
             self._transport = transport_advice(image_bytes, os.environ, rmw)

@@ -22,6 +22,8 @@ import pytest
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
 
 from semcal_ros.nodes.common.publisher import PatientPublisher
 
@@ -34,6 +36,7 @@ class Middleware:
         self.calls = 0
         self.taken: list[str] = []
         self.publisher: Any = object.__new__(PatientPublisher)
+        self.publisher.qos_profile = QoSProfile(depth=1)
         monkeypatch.setattr(Publisher, "publish", lambda _self, message: self.take(message))
         monkeypatch.setattr("rclpy.utilities.ok", lambda: up)
 
@@ -84,3 +87,45 @@ def test_a_message_is_awaited_by_subscribers_now_or_later(
     if published:
         publisher.publish("message")
     assert publisher.is_awaited is awaited
+
+
+class Receiver:
+    def __init__(self) -> None:
+        self.taken: list[tuple[Any, int]] = []
+
+    def deliver(self, message: Any, sent_ns: int, number: int) -> None:
+        assert sent_ns > 0
+        self.taken.append((message, number))
+
+
+@pytest.mark.parametrize(("durability", "passed_on"), [("volatile", 0), ("transient_local", 2)])
+def test_what_is_handed_over_in_memory_goes_to_the_middleware_only_where_somebody_waits(
+    monkeypatch: pytest.MonkeyPatch, durability: str, passed_on: int
+) -> None:
+    middleware, receiver, others = Middleware(0, monkeypatch), Receiver(), 0
+    publisher = middleware.publisher
+    publisher.qos_profile = QoSProfile(depth=1, durability=DurabilityPolicy[durability.upper()])
+    monkeypatch.setattr(Publisher, "get_subscription_count", lambda _self: others)
+    publisher.hand_to(receiver)
+    assert publisher.get_subscription_count() == 1
+    for text in ("first", "second"):
+        publisher.publish(text)
+    assert receiver.taken == [("first", 1), ("second", 2)]
+    assert len(middleware.taken) == passed_on
+    others = 1
+    publisher.publish("third")
+    assert middleware.taken[-1] == "third"
+    assert receiver.taken[-1] == ("third", 3)
+
+
+def test_a_late_receiver_gets_the_last_message_of_a_latched_topic_unpacked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    publisher, receiver = Middleware(0, monkeypatch).publisher, Receiver()
+    publisher.msg_type = String
+    publisher.qos_profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for text in ("old", "new"):
+        publisher.publish(serialize_message(String(data=text)))
+    publisher.hand_to(receiver)
+    ((message, number),) = receiver.taken
+    assert (message.data, number) == ("new", 2)

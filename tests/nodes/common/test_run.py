@@ -116,3 +116,71 @@ def _run(
         check=False,
         preexec_fn=preexec,
     )
+
+
+# Two nodes in one process. One of them ends: by what its timer raises, or by itself as a recording does; or it hangs
+# while the process is asked to end; or what it raises is taken for its own affair.
+PARTS = """
+import os, signal, sys, threading, time
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from semcal_ros.nodes.common.run import Part, Parts, run_parts
+
+how = sys.argv[1]
+left = [3]
+
+class Other(Node):
+    def __init__(self):
+        super().__init__("other")
+        self._timer = self.create_timer(0.05, self._tick)
+
+    def _tick(self):
+        print("tick", flush=True)
+        if how in ("raises", "forgiven"):
+            raise OSError("no stage")
+        if how == "ends":
+            raise ExternalShutdownException
+        if how == "hangs":
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(60.0)
+
+class Worker(Node):
+    def __init__(self):
+        super().__init__("worker")
+        self.exit_status = 3
+        self._timer = self.create_timer(0.2, self._work)
+
+    def _work(self):
+        left[0] -= left[0] > 0
+        if how == "forgiven" and not left[0]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+def forgive(error):
+    print(f"forgiven {error}", flush=True)
+
+def make():
+    other = Part(Other(), forgive if how == "forgiven" else None)
+    return Parts(Node("lead"), [other, Part(Worker())], lambda: left[0] > 0)
+
+status = run_parts(make, ["--ros-args", "--log-level", "error"])
+print("left", left[0])
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "status", "said"),
+    [
+        ("raises", 1, "OSError: no stage"),
+        # What waits is worked off first.
+        ("ends", 3, "left 0"),
+        ("hangs", 3, "still busy, and left: other"),
+        ("forgiven", 3, "forgiven no stage\ntick\nforgiven no stage"),
+    ],
+)
+def test_parts_of_a_process_end_together(how: str, status: int, said: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PARTS, how], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == status, done.stderr
+    assert said in done.stdout + done.stderr

@@ -62,6 +62,7 @@ def test_an_image_has_a_camera_only_where_the_calibration_covers_it(
         calibration=SimpleNamespace(current=CALIBRATION),
         parameters={"uncalibrated": "pass", "out_of_range": choice},
         output=SimpleNamespace(publish=lambda camera, _frame: published.append(camera)),
+        _receivers=[],
         _watch=SimpleNamespace(check=lambda: None, differs=False),
     )
     camera, frame = CALIBRATION.at(magnification), SimpleNamespace(mixed=mixed)
@@ -77,6 +78,7 @@ def test_images_without_a_calibration_go_out_only_if_they_may(choice: str, count
         calibration=SimpleNamespace(current=None),
         parameters={"uncalibrated": choice, "out_of_range": "flag"},
         output=SimpleNamespace(publish=lambda camera, _frame: published.append(camera)),
+        _receivers=[],
         reporter=reporter,
         _watch=SimpleNamespace(check=lambda: None, differs=False),
         _dropped=0,

@@ -120,6 +120,7 @@ def test_images_under_other_conditions_go_out_only_if_they_may(choice: str, coun
         calibration=SimpleNamespace(current=CALIBRATION),
         parameters={"uncalibrated": "pass", "out_of_range": "flag", "on_mismatch": choice},
         output=SimpleNamespace(publish=lambda camera, _frame: published.append(camera)),
+        _receivers=[],
         reporter=bench.reporter,
         _watch=bench.watch,
         _refused=0,

@@ -23,9 +23,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["CalibratedFrame", "Positions"]
+__all__ = [
+    "CalibratedFrame",
+    "Positions",
+    "describe_missing_camera",
+    "rectified_projection",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,3 +226,32 @@ class CalibratedFrame:
         if out.ndim != 2 or out.shape[1] not in widths or not np.all(np.isfinite(out)):
             raise InvalidValueError(f"points of shape {out.shape}", expected=expected)
         return out
+
+
+def rectified_projection(camera: ScanCamera | None) -> tuple[Array, Array]:
+    """Return the projection (3, 4) of rectified images and the covariance (12, 12) of its numbers.
+
+    Both are zero without a camera, the covariance also where that of the camera is not known.
+    """
+    if camera is None:
+        return np.zeros((3, 4)), np.zeros((12, 12))
+    rectified = camera.rectified
+    known = rectified.covariance is not None
+    return rectified.P_affine, rectified.P_affine_covariance if known else np.zeros((12, 12))
+
+
+def describe_missing_camera(magnification: float | None, *, mixed: bool = False) -> str:
+    """Say why a frame of a live stream has no camera.
+
+    Parameters
+    ----------
+    magnification
+        At which it was taken; None where that is not known.
+    mixed
+        Whether the magnification changed while it was scanned.
+    """
+    if mixed:
+        return "the magnification changed while it was scanned"
+    if magnification is None:
+        return "no camera: its magnification is not known"
+    return f"no camera at magnification {magnification:g}: no calibration, or outside its range"
