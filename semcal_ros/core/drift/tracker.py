@@ -119,7 +119,8 @@ _MAX_TURN_PX = 0.1
 _MIN_INTERVAL_S = 1e-9
 # Frames in which an overlay is looked for: the first ones, and then every so many.
 _FIRST_LOOKS, _LOOK_EVERY = 3, 8
-# What stays in place is looked for as soon as the specimen has moved, the first times, and then after so many frames.
+# What stays in place is looked for as soon as the specimen has moved, the first times, and then after one frame more
+# each time, up to so many: a spot does not show where the specimen is as dark.
 _FIXED_FIRST, _FIXED_LATER = 4, 32
 # Part of the image that must newly be found to stay, for keyframes to be freed of it.
 _NEWLY_FIXED = 2e-4
@@ -390,7 +391,7 @@ class DriftTracker:
             and fixed.image.shape == pixels.shape
             and np.allclose(fixed.px_from_unit, frame.px_from_unit)
         ):
-            every = 1 if fixed.looks < _FIXED_FIRST else _FIXED_LATER
+            every = min(1 + max(0, fixed.looks - _FIXED_FIRST), _FIXED_LATER)
             moved_px = drift_px - fixed.drift_px
             if fixed.since < every or np.hypot(*moved_px) < LEAST_MOVE_PX:
                 return False
