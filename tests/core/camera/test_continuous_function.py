@@ -110,12 +110,12 @@ def test_breaks_may_lie_in_the_extension() -> None:
     assert function(15000.0) - before == pytest.approx(0.02, abs=1e-6)
 
 
-@pytest.mark.parametrize("knots", [[10000.0], [9000.0, 20000.0], [10000.0, 5000.0], [10000.0, np.inf]])
+@pytest.mark.parametrize(
+    "knots", [[10000.0], [9000.0, 20000.0], [10000.0, 5000.0], [10000.0, np.inf]]
+)
 def test_an_extension_begins_at_an_end_and_goes_outwards(knots: list[float]) -> None:
     with pytest.raises(InvalidValueError, match="extension|coefficient"):
-        ContinuousFunction(
-            "chebyshev_log", np.array([1.0, 0.1]), RANGE, extension=np.array(knots)
-        )
+        ContinuousFunction("chebyshev_log", np.array([1.0, 0.1]), RANGE, extension=np.array(knots))
 
 
 def test_single_magnification_is_a_constant():
