@@ -147,7 +147,8 @@ def draw_scope(
     skew = rng.uniform(-0.004, 0.004, 2)
     radial = rng.uniform(-0.008, 0.008), rng.uniform(-0.003, 0.003)
     tangential = rng.uniform(-0.001, 0.001, 2)
-    middle = 0.5 * (size - 1) + rng.uniform(-0.06, 0.06, (2, 2)) * size * np.array([[1.0], [0.3]])
+    middle = 0.5 * (size - 1) + size * rng.uniform(-0.06, 0.06, 2)
+    moved = size * rng.uniform(-0.015, 0.015, 2)
     bend = float(np.exp(rng.uniform(np.log(3e3), np.log(2e4))))
 
     def law(g: float) -> tuple[float, float, float, float, float, float, float]:
@@ -156,7 +157,7 @@ def draw_scope(
         m = g * size / display * (1.0 + end + fall * late) * jump
         ratio = aspect[0] + aspect[1] * late**2
         lens = radial[0] + radial[1] * late, tangential[0] + tangential[1] * late
-        ex, ey = (middle[0] + middle[1] * late).tolist()
+        ex, ey = (middle + moved * late).tolist()
         return m * ratio, m / ratio, m * float(skew[0] + skew[1] * late), *map(float, lens), ex, ey
 
     return Scope(size, size, display, law)

@@ -46,8 +46,9 @@ from numpy.typing import NDArray
 
 from benchmarks.calibration.grains import Grains, Scope, draw_scope, take_picture
 from benchmarks.table import show
+from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
-from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
+from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.predicted_error import predict_aligned_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.ladder.extend import LadderPicture, LadderResult, extend_calibration
@@ -87,15 +88,29 @@ def draw_case(seed: int, size: int, with_relay: bool) -> Case:
     rng = np.random.default_rng([seed, 35])
     relay = (float(np.exp(rng.uniform(np.log(1.3e4), np.log(7e4)))), 0.005) if with_relay else None
     scope = draw_scope(rng, size, relay)
-    views = grid_views(
-        lambda g: camera_at(scope, g), CALIBRATED, views=5, noise_px=0.05, seed=seed, square_px=30.0
-    )
     # The squares are not what the certificate says.
     stretch = 1.0 + SQUARES * float(rng.normal())
-    views = [replace(view, board_xy_m=view.board_xy_m * stretch) for view in views]
-    found = calibrate_views(views, image_size=(size, size), display_width_m=scope.display_m)
-    sigma = ScaleSigma(repeatability=REPEATABILITY, grid=SQUARES)
-    return Case(scope, replace(found.model, scale_sigma=sigma), relay, rng)
+    views = []
+    for way in range(2):
+        for number, g in enumerate(CALIBRATED):
+            camera = camera_at(scope, g)
+            back = replace(camera, m=camera.m * (1.0 + REPEATABILITY * float(rng.normal())))
+            views += [
+                replace(view, board_xy_m=view.board_xy_m * stretch, visit=way * 100 + number)
+                for view in grid_views(
+                    lambda _, camera=back: camera,
+                    [g],
+                    views=3,
+                    noise_px=0.05,
+                    seed=seed * 64 + way * 32 + number,
+                    square_px=30.0,
+                )
+            ]
+    options = CalibrationOptions(squares_sigma=SQUARES)
+    found = calibrate_views(
+        views, image_size=(size, size), display_width_m=scope.display_m, options=options
+    )
+    return Case(scope, found.model, relay, rng)
 
 
 def record(case: Case, last: float = 1e5, pictures: int = 4) -> list[LadderPicture]:

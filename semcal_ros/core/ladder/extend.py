@@ -50,6 +50,7 @@ from semcal_ros.core.ladder.unknowns import (
     LadderState,
     PicturePlace,
     make_setup,
+    prior_root,
     start_state,
 )
 from semcal_ros.core.wording import counted
@@ -676,10 +677,9 @@ def _with_field(setup: LadderSetup, fit: LadderFit, columns: Array, functions: A
     model = setup.model
     size = sum(function.size for function in model.functions.values())
     field = model.covariance[size:, size:]
-    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
-    kept = variances > 1e-14 * variances.max()
-    root = directions[:, kept] * np.sqrt(variances[kept])
-    cross = np.linalg.pinv(root) @ model.covariance[:size, size:]
+    cross = (
+        np.linalg.pinv(prior_root(model.covariance[:size, :size])) @ model.covariance[:size, size:]
+    )
     gain = fit.covariance[: setup.bounds[2].stop, setup.bounds[0]]
     new_cross = columns @ gain @ cross
     return np.block([[functions, new_cross], [new_cross.T, field]])

@@ -35,7 +35,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.arrays import Array, Indices, equilibrate
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
     CalibrationModel,
@@ -53,6 +53,7 @@ __all__ = [
     "PicturePlace",
     "extend_functions",
     "make_setup",
+    "prior_root",
     "start_state",
 ]
 
@@ -69,7 +70,8 @@ _LEAST_BEND_OTHERS = 4e-3
 _BEND_FACTOR = 2.0
 # 1-sigma of a jump of the scale that was found, and of one that is not there.
 JUMP_SIGMA, _NO_JUMP = 0.03, 1e-9
-# Magnifications of a jump belong to one place only where they differ by less than this.
+# Of the largest eigenvalue of a matrix of correlations: what is below is rounding.
+_SINGULAR = 1e-13
 _SLOPE_SIGMA_RAD = 0.0087
 # Least repeatability of the scale of a magnification that is set again: that of the last digit of a scan generator.
 _LEAST_VISIT = 2e-5
@@ -344,10 +346,9 @@ def make_setup(
             (old_columns if known else jumps).append(start + number)
         column += own.size
     size = sum(model.functions[name].size for name in names)
-    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
-    kept_directions = variances > 1e-14 * variances.max()
-    root = np.zeros((column, int(np.count_nonzero(kept_directions))))
-    root[old_columns] = directions[:, kept_directions] * np.sqrt(variances[kept_directions])
+    known = prior_root(model.covariance[:size, :size])
+    root = np.zeros((column, known.shape[1]))
+    root[old_columns] = known
     return LadderSetup(
         model=model,
         functions=functions,
@@ -360,6 +361,15 @@ def make_setup(
         intervals=intervals,
         visit_sigma=max(model.scale_sigma.repeatability, _LEAST_VISIT),
     )
+
+
+def prior_root(covariance: Array) -> Array:
+    """(K, Z) matrix whose product with its transpose is a covariance (K, K), which may be singular."""
+    # Pixels beside normalised coordinates: without the scaling, rounding would take the small ones.
+    scaled, scale = equilibrate(covariance)
+    variances, directions = np.linalg.eigh(scaled)
+    kept = variances > _SINGULAR * variances.max()
+    return np.asarray(directions[:, kept] * np.sqrt(variances[kept]) / scale[:, None])
 
 
 def _bend_sigma(model: CalibrationModel, name: str) -> float:
