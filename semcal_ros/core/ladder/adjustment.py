@@ -25,6 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from semcal_ros.core.arrays import Array, equilibrate, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.trust_region import (
@@ -44,14 +45,18 @@ from semcal_ros.core.ladder.unknowns import (
     slope_sigma,
 )
 
-__all__ = ["LadderFit", "add_up", "adjust", "prior_information"]
+__all__ = ["DriftSpread", "LadderFit", "add_up", "adjust", "prior_information"]
 
 # Gauss-Newton steps; from the poses of the correspondences five are enough.
 _ITERATIONS, _TOLERANCE = 30, 1e-9
-# A first spread of the drift in a frame, px, and bounds: half a pixel is what a good stage does, and more than a tenth
-# of the picture is no drift. The spread is estimated until it changes by less than 2 %.
-_FIRST_DRIFT_PX, _LEAST_DRIFT_PX, _MOST_DRIFT = 1.0, 0.03, 0.1
-_SPREAD_ROUNDS, _SPREAD_STEPS, _SPREAD_CHANGE = 3, 200, 0.02
+# Spreads of the drift in a frame of the finest magnification that are tried, px: a tenth of a pixel is what a stage
+# that has settled does, and more than a thirtieth of the picture is no drift.
+_FIRST_DRIFT_PX, _LEAST_DRIFT_PX, _MOST_DRIFT = 0.5, 0.02, 0.03
+_SPREADS, _SPREAD_ROUNDS = 12, 3
+# Scans whose angle differs by less are not turned, rad.
+_TURNED_RAD = 0.5
+# Vibration stretches a frame by this at any magnification, px.
+_LEAST_CHANGE_PX = 0.01
 # A jump must lower twice the cost by this: of 12 places without one, 3 in 10 000 do so by chance.
 _JUMP_GAIN = 20.0
 _MOST_JUMPS = 4
@@ -59,6 +64,22 @@ _MOST_JUMPS = 4
 _GAUGE = (1e-9, 1e-7)
 # Links whose mean square residual exceeds that of the others by this factor are left out: chance makes 2.
 _BAD_LINK = 9.0
+
+
+@dataclass(frozen=True)
+class DriftSpread:
+    """1-sigma of the drift during a frame per axis, px of the finest magnification.
+
+    Attributes
+    ----------
+    steady_px
+        Of what all pictures of a visit have in common.
+    change_px
+        Of what each has beside that.
+    """
+
+    steady_px: float
+    change_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +96,8 @@ class LadderFit:
         Mean square of the residuals over their sigmas, for the degrees of freedom.
     link_factors
         The same of each link.
-    drift_sigma_px
-        Spread of the drift within a frame, px.
+    drift
+        Spread of the drift within a frame.
     jumps
         Which of the jumps were found.
     kept
@@ -89,15 +110,24 @@ class LadderFit:
     covariance: Array
     variance_factor: float
     link_factors: Array
-    drift_sigma_px: float
+    drift: DriftSpread
     jumps: tuple[int, ...]
     kept: tuple[int, ...]
     descent: Descent[LadderState]
 
 
-def prior_information(setup: LadderSetup, drift_sigma_px: float, jumps: tuple[int, ...]) -> Array:
+def drift_sigmas(setup: LadderSetup, drift_sigma_px: float) -> Array:
+    """(M,) 1-sigma of the change of the drift in each picture, px, where it is ``drift_sigma_px`` in the finest.
+
+    A specimen drifts by as many metres at all magnifications.
+    """
+    magnifications = np.array([picture.magnification for picture in setup.pictures])
+    return np.hypot(drift_sigma_px * magnifications / magnifications.max(), _LEAST_CHANGE_PX)
+
+
+def prior_information(setup: LadderSetup, drift: DriftSpread, jumps: tuple[int, ...]) -> Array:
     """(N,) inverse variances of the priors, all of mean zero but those of the bends' start."""
-    components, bends, steps, visits, slopes, poses = setup.bounds
+    components, bends, steps, visits, slopes, poses, drifts = setup.bounds
     information = np.zeros(setup.size)
     information[components] = 1.0
     information[bends] = 1.0 / setup.bend_sigmas**2
@@ -105,7 +135,10 @@ def prior_information(setup: LadderSetup, drift_sigma_px: float, jumps: tuple[in
     information[visits] = 1.0 / setup.visit_sigma**2
     information[slopes] = 1.0 / slope_sigma() ** 2
     own = information[poses].reshape(-1, POSE_SIZE)
-    own[:, 3:] = 1.0 / drift_sigma_px**2
+    own[:, 3:] = drift_sigmas(setup, drift.change_px)[:, None] ** -2
+    for visit, spread in zip(setup.visit_of, drift_sigmas(setup, drift.steady_px), strict=True):
+        start = drifts.start + 2 * int(visit)
+        information[start : start + 2] = spread**-2
     own[0, 0], own[0, 1:3] = _GAUGE[0] ** -2, _GAUGE[1] ** -2
     information[poses] = own.ravel()
     return information
@@ -140,7 +173,7 @@ def adjust(
     """
     jumps: tuple[int, ...] = ()
     kept = tuple(range(len(links)))
-    drift = _FIRST_DRIFT_PX
+    drift = DriftSpread(_FIRST_DRIFT_PX, _FIRST_DRIFT_PX)
     while True:
         used = [links[k] for k in kept]
         state, drift, descent = _settle(setup, state, used, drift, jumps)
@@ -182,37 +215,64 @@ def _settle(
     setup: LadderSetup,
     state: LadderState,
     links: Sequence[Link],
-    drift: float,
+    drift: DriftSpread,
     jumps: tuple[int, ...],
-) -> tuple[LadderState, float, Descent[LadderState]]:
+) -> tuple[LadderState, DriftSpread, Descent[LadderState]]:
     """Adjust, with the spread of the drift within the frames."""
-    poses, most = setup.bounds[5], _MOST_DRIFT * setup.image_size[1]
     for _ in range(_SPREAD_ROUNDS):
         descent = _descend(setup, state, links, drift, jumps)
         state, before = descent.state, drift
         matrix, right, _ = add_up(state, links)
-        # Another spread moves the unknowns by little, so that the equations stay as they are.
-        wanted = right + matrix @ state.values
-        for _ in range(_SPREAD_STEPS):
-            inverse = invert_scaled(matrix + np.diag(prior_information(setup, drift, jumps)))
-            values = (inverse @ wanted)[poses].reshape(-1, POSE_SIZE)[:, 3:]
-            variances = np.diag(inverse)[poses].reshape(-1, POSE_SIZE)[:, 3:]
-            # The spread that the values and what is not known of them make most likely (expectation-maximisation).
-            now = float(np.clip(np.sqrt(np.mean(values**2 + variances)), _LEAST_DRIFT_PX, most))
-            settled = abs(np.log(now / drift)) < 0.05 * _SPREAD_CHANGE
-            drift = now
-            if settled:
-                break
-        if abs(np.log(drift / before)) < _SPREAD_CHANGE:
+        drift = _most_likely_drift(setup, state, matrix, right, jumps)
+        if drift == before:
             break
     return state, drift, descent
+
+
+def _most_likely_drift(
+    setup: LadderSetup, state: LadderState, matrix: Array, right: Array, jumps: tuple[int, ...]
+) -> DriftSpread:
+    """The spread of the drift that makes the correspondences most likely, whatever the unknowns are.
+
+    Minus twice the logarithm of the marginal likelihood is, but for a constant, -b' H^-1 b + log det H - log det P,
+    with the equations ``H x = b`` with the prior ``P``. Another spread moves the unknowns by little, so that the
+    equations of the pictures stay as they are. All spreads are tried, since there may be more than one minimum.
+    """
+    wanted = right + matrix @ state.values
+    most = _MOST_DRIFT * setup.image_size[1]
+    spreads = np.geomspace(_LEAST_DRIFT_PX, most, _SPREADS).tolist()
+    # Without a turned scan a steady drift is a stretch of the camera, and its spread is that of the changes.
+    steady = spreads if _has_turns(setup, state) else [None]
+    best, least = DriftSpread(spreads[0], spreads[0]), np.inf
+    for change in spreads:
+        for common in steady:
+            drift = DriftSpread(change if common is None else common, change)
+            information = prior_information(setup, drift, jumps)
+            scaled, scale = equilibrate(matrix + np.diag(information))
+            factor = np.linalg.cholesky(scaled)
+            half = solve_triangular(factor, scale * wanted, lower=True)
+            cost = 2.0 * float(np.sum(np.log(np.diag(factor))) - np.sum(np.log(scale)))
+            cost -= float(half @ half) + float(np.sum(np.log(information[information > 0.0])))
+            if cost < least:
+                best, least = drift, cost
+    return best
+
+
+def _has_turns(setup: LadderSetup, state: LadderState) -> bool:
+    """Whether a third of the visits has a scan that is turned against the others."""
+    angles = state.poses[:, 0]
+    turned = 0
+    for visit in range(len(setup.visits)):
+        own = angles[setup.visit_of == visit]
+        turned += bool(np.any(np.abs(np.angle(np.exp(1j * (own - own[0])))) > _TURNED_RAD))
+    return 3 * turned >= len(setup.visits)
 
 
 def _descend(
     setup: LadderSetup,
     state: LadderState,
     links: Sequence[Link],
-    drift: float,
+    drift: DriftSpread,
     jumps: tuple[int, ...],
 ) -> Descent[LadderState]:
     information = prior_information(setup, drift, jumps)
@@ -256,7 +316,7 @@ def _find_jump(
     state: LadderState,
     matrix: Array,
     right: Array,
-    drift: float,
+    drift: DriftSpread,
     jumps: tuple[int, ...],
 ) -> int | None:
     """The jump that would lower the cost most, if by enough."""

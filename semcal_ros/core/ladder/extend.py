@@ -154,8 +154,8 @@ class LadderResult:
         Names of pictures that were not used.
     tilt_rad, tilt_sigma_rad
         Slope of the specimen, and how well it is known.
-    drift_sigma_px
-        Spread of the drift within a frame, px of the pictures.
+    drift_px
+        1-sigma of the drift within a frame at the highest magnification, px.
     variance_factor
         Mean square of the residuals over their sigmas.
     weaknesses
@@ -168,7 +168,7 @@ class LadderResult:
     unused: tuple[str, ...]
     tilt_rad: float
     tilt_sigma_rad: float
-    drift_sigma_px: float
+    drift_px: float
     variance_factor: float
     weaknesses: tuple[str, ...]
 
@@ -247,7 +247,7 @@ def extend_calibration(
         "pictures": len(used),
         "pairs": len(fit.kept),
         "variance_factor": fit.variance_factor,
-        "drift_sigma_px": fit.drift_sigma_px / scale,
+        "drift_px": _drift_px(fit) / scale,
         "tilt_rad": tilt,
         "relays": [[relay.low, relay.high, relay.jump] for relay in _relays(setup, fit)],
         "magnifications": [step.magnification for step in steps],
@@ -261,7 +261,7 @@ def extend_calibration(
         tuple(pictures[k].name or f"picture {k}" for k in unused),
         tilt,
         tilt_sigma,
-        fit.drift_sigma_px / scale,
+        _drift_px(fit) / scale,
         fit.variance_factor,
         weaknesses,
     )
@@ -556,6 +556,10 @@ def _rigid(source: Array, target: Array) -> tuple[float, Array]:
 
 
 # -- what came out --------------------------------------------------------------------------------
+
+
+def _drift_px(fit: LadderFit) -> float:
+    return float(np.hypot(fit.drift.steady_px, fit.drift.change_px))
 
 
 def _tilt(setup: LadderSetup, fit: LadderFit) -> tuple[float, float]:

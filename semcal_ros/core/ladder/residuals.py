@@ -155,6 +155,7 @@ class _Seen:
     by_camera: Array
     by_pose: Array
     by_slope: Array
+    by_drift: Array
 
 
 def _see(state: LadderState, picture: int, places: Array, time: Array) -> _Seen:
@@ -169,18 +170,21 @@ def _see(state: LadderState, picture: int, places: Array, time: Array) -> _Seen:
     by_flat, by_height = seen.d_xyz[:, :, :2], seen.d_xyz[:, :, 2]
     by_place = by_flat @ turn + by_height[:, :, None] * slope
     by_pose = np.empty((len(places), 2, POSE_SIZE))
-    by_pose[:, :, 0] = np.einsum("nij,nj->ni", by_flat, places @ turned.T)
+    moved = places + pixel * time[:, None] * state.drifts[picture]
+    by_pose[:, :, 0] = np.einsum("nij,nj->ni", by_flat, moved @ turned.T)
     by_pose[:, :, 1:3] = pixel * by_flat
     by_pose[:, :, 3:5] = pixel * time[:, None, None] * by_flat
     by_slope = by_height[:, :, None] * places[:, None, :]
-    return _Seen(seen.xy, by_place, seen.d_parameters, by_pose, by_slope)
+    by_drift = pixel * time[:, None, None] * (by_flat @ turn)
+    return _Seen(seen.xy, by_place, seen.d_parameters, by_pose, by_slope, by_drift)
 
 
 def _in_sem_frame(state: LadderState, picture: int, places: Array, time: Array) -> Array:
     pose = state.poses[picture]
     pixel = state.setup.pixel_m(state.setup.pictures[picture].magnification)
     turn, _ = _turn(float(pose[0]))
-    flat = places @ turn.T + pixel * (pose[1:3] + time[:, None] * pose[3:5])
+    moved = places + pixel * time[:, None] * state.drifts[picture]
+    flat = moved @ turn.T + pixel * (pose[1:3] + time[:, None] * pose[3:5])
     return np.column_stack([flat, places @ state.slope])
 
 
@@ -191,6 +195,7 @@ def place_on_specimen(state: LadderState, picture: int, xy: Array, time: Array) 
     turn, _ = _turn(float(pose[0]))
     flat = camera.sem_from_ideal(camera.undistort(xy))[:, :2]
     places = (flat - pixel * (pose[1:3] + time[:, None] * pose[3:5])) @ turn
+    places = places - pixel * time[:, None] * state.drifts[picture]
     if np.any(state.slope):
         for _ in range(_STEPS):
             seen = _see(state, picture, places, time)
@@ -218,24 +223,30 @@ def pair_rows(state: LadderState, link: Link) -> PairRows:
     count = len(link)
     blocks: list[tuple[Indices, Array]] = []
     total = np.zeros((count, 2, functions.shape[1]))
-    visits: dict[int, Array] = {}
+    visits: dict[int, tuple[Array, Array]] = {}
+    nothing = np.zeros((count, 2))
     for number, seen in ((first, here), (second, there)):
-        by_camera, by_pose = seen.by_camera, seen.by_pose
+        by_camera, by_pose, by_drift = seen.by_camera, seen.by_pose, seen.by_drift
         if number == first:
-            by_camera, by_pose = follow @ by_camera, follow @ by_pose
+            by_camera, by_pose, by_drift = (
+                follow @ part for part in (by_camera, by_pose, by_drift)
+            )
         scale = 1.0 + state.visit_scales[number]
         design = setup.design(setup.pictures[number].magnification) @ functions
         design[0] *= scale
         total += by_camera @ design
         visit = int(setup.visit_of[number])
         by_scale = by_camera[:, :, 0] * (state.parameters[number, 0] / scale)
-        visits[visit] = visits.get(visit, np.zeros((count, 2))) + by_scale
+        before = visits.get(visit, (nothing, np.zeros((count, 2, 2))))
+        visits[visit] = before[0] + by_scale, before[1] + by_drift
         start = setup.bounds[5].start + POSE_SIZE * number
         blocks.append((np.arange(start, start + POSE_SIZE), by_pose))
     slopes = setup.bounds[4]
     blocks.append((np.arange(slopes.start, slopes.stop), there.by_slope + follow @ here.by_slope))
-    for visit, by_scale in visits.items():
+    for visit, (by_scale, by_drift) in visits.items():
         blocks.append((np.array([setup.bounds[3].start + visit]), by_scale[:, :, None]))
+        start = setup.bounds[6].start + 2 * visit
+        blocks.append((np.arange(start, start + 2), by_drift))
     columns = np.concatenate([np.arange(functions.shape[1]), *(part for part, _ in blocks)])
     jacobian = np.concatenate([total, *(values for _, values in blocks)], axis=2)
     residual = link.second_xy - there.xy

@@ -21,9 +21,11 @@ are known, so that nothing that the pictures do not show is made up between thei
 
 The specimen is a plane. What lies at x on it, in m, is seen by picture i at
 
-    X = R(turn_i) x + shift_i + drift_i tau
+    X = R(turn_i) (x + drift_v tau) + shift_i + change_i tau
 
-in the sem frame, at the height ``slope . x``; tau is the time of the pixel from -1/2 to 1/2 of the frame.
+in the sem frame, at the height ``slope . x``; tau is the time of the pixel from -1/2 to 1/2 of the frame. The drift of
+a visit turns with the specimen, and that of a picture differs from it by its change: a stretch of all pictures that
+does not turn is the camera's.
 """
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ __all__ = [
     "start_state",
 ]
 
-#: Turn (rad), shift (x, y) and drift during the frame (x, y), both in nominal pixels of the picture.
+#: Turn (rad), shift (x, y) and change of the drift (x, y), both in nominal pixels of the picture.
 POSE_SIZE = 5
 # Pictures of a flat specimen from above tell nothing of these.
 _UNSEEN = ("px", "py", "rho")
@@ -176,8 +178,8 @@ class LadderSetup:
         return 1.0 / self.model.nominal_px_per_m(magnification)
 
     @cached_property
-    def bounds(self) -> tuple[slice, slice, slice, slice, slice, slice]:
-        """Where components, bends, jumps, visits, slopes and poses stand among the unknowns."""
+    def bounds(self) -> tuple[slice, slice, slice, slice, slice, slice, slice]:
+        """Where components, bends, jumps, visits, slopes, poses and drifts of visits stand among the unknowns."""
         sizes = (
             self.root.shape[1],
             len(self.bend_columns),
@@ -185,10 +187,11 @@ class LadderSetup:
             len(self.visits),
             2,
             POSE_SIZE * len(self.pictures),
+            2 * len(self.visits),
         )
         ends = np.cumsum([0, *sizes]).tolist()
-        first, second, third, fourth, fifth, sixth = (slice(a, b) for a, b in pairwise(ends))
-        return first, second, third, fourth, fifth, sixth
+        first, second, third, fourth, fifth, sixth, last = (slice(a, b) for a, b in pairwise(ends))
+        return first, second, third, fourth, fifth, sixth, last
 
     @property
     def size(self) -> int:
@@ -247,6 +250,12 @@ class LadderState:
     def poses(self) -> Array:
         """(M, 5) poses of the pictures."""
         return self.values[self.setup.bounds[5]].reshape(-1, POSE_SIZE)
+
+    @property
+    def drifts(self) -> Array:
+        """(M, 2) drift during a frame of the visit of each picture, on the specimen, in nominal px."""
+        own = self.values[self.setup.bounds[6]].reshape(-1, 2)
+        return np.asarray(own[self.setup.visit_of])
 
     @property
     def slope(self) -> Array:
@@ -342,8 +351,8 @@ def make_setup(
         sigmas += [_bend_sigma(model, name)] * new_bends
         start = column + kept + new_bends
         for number, place in enumerate(own.breaks):
-            known = np.any(np.isclose(place, before.breaks, rtol=1e-12))
-            (old_columns if known else jumps).append(start + number)
+            is_old = bool(np.any(np.isclose(place, before.breaks, rtol=1e-12)))
+            (old_columns if is_old else jumps).append(start + number)
         column += own.size
     size = sum(model.functions[name].size for name in names)
     known = prior_root(model.covariance[:size, :size])
