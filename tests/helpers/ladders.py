@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,6 +31,7 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.ladder.extend import LadderPicture
 from semcal_ros.synthetic.grid_views import grid_views
+from tests.helpers.made_once import made_once
 
 __all__ = [
     "REPEATABILITY",
@@ -76,7 +78,12 @@ def calibration_of(scope: Scope) -> CalibrationModel:
         )
         views += [replace(view, visit=visit) for view in seen]
     size = (scope.width, scope.height)
-    return calibrate_views(views, image_size=size, display_width_m=scope.display_m).model
+    numbers = [scope.display_m, *scope.law(1000.0), *scope.law(8000.0)]
+    name = hashlib.sha256(repr(numbers).encode()).hexdigest()[:16]
+    return made_once(
+        f"ladder-{name}",
+        lambda: calibrate_views(views, image_size=size, display_width_m=scope.display_m).model,
+    )
 
 
 def _same(camera: ScanCamera, _magnification: float) -> ScanCamera:

@@ -82,6 +82,8 @@ _MOST_SIGMA_PX = 0.5
 # Robust standard deviations of blocks about the smooth map beyond which they show something else: of a thousand blocks
 # none is so far off by chance.
 _OUTLIER_SIGMAS = 5.0
+# Of the blocks, that must agree with one smooth map: dust may move, but where a third does, nothing says which.
+_LEAST_SHARE = 0.7
 # A displacement longer than this at the finest resolution is none that least squares has found, px.
 _MOST_STEP_PX = 1.5
 # A map of the fourth degree has 15 coefficients.
@@ -267,7 +269,6 @@ def match_pictures(
     predict: Callable[[Array], Array],
     *,
     search: bool = True,
-    keep: float = 1.0,
 ) -> Correspondences | Rejection[PairFailure]:
     """Find where the second picture shows what the first one does.
 
@@ -279,8 +280,6 @@ def match_pictures(
         From pixels (n, 2) of the first to those of the second, right up to a shift, half a degree, and a per cent.
     search
         Whether to search over all shifts; otherwise the prediction is right to two pixels.
-    keep
-        Part of the blocks that must agree with one smooth map: not below this.
     """
     for picture, name in ((first, "first"), (second, "second")):
         if picture.is_featureless:
@@ -310,7 +309,7 @@ def match_pictures(
             break
         smooth = _follow(smooth, step)
     assert blocks is not None
-    return _conclude(blocks, step, smooth, keep)
+    return _conclude(blocks, step, smooth)
 
 
 def _fit_prediction(predict: Callable[[Array], Array], size: tuple[int, int]) -> SmoothMap:
@@ -545,14 +544,14 @@ def _fit_step(blocks: _Blocks, size: tuple[int, int], degree: int) -> _Step:
 
 
 def _conclude(
-    blocks: _Blocks, step: _Step, smooth: SmoothMap, keep: float
+    blocks: _Blocks, step: _Step, smooth: SmoothMap
 ) -> Correspondences | Rejection[PairFailure]:
     inside = step.inside
     share = float(np.mean(inside))
     correlation = float(np.median(blocks.correlation[inside]))
     if correlation < _LEAST_CORRELATION:
         return Rejection(PairFailure.NO_OVERLAP, f"blocks that correlate by {correlation:.2f}")
-    if share < keep:
+    if share < _LEAST_SHARE:
         return Rejection(
             PairFailure.INCONSISTENT,
             f"{100.0 * (1.0 - share):.0f} % of the blocks do not move with the rest",

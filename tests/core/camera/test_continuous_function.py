@@ -114,7 +114,7 @@ def test_breaks_may_lie_in_the_extension() -> None:
     "knots", [[10000.0], [9000.0, 20000.0], [10000.0, 5000.0], [10000.0, np.inf]]
 )
 def test_an_extension_begins_at_an_end_and_goes_outwards(knots: list[float]) -> None:
-    with pytest.raises(InvalidValueError, match="extension|coefficient"):
+    with pytest.raises(InvalidValueError, match=r"extension|coefficient"):
         ContinuousFunction("chebyshev_log", np.array([1.0, 0.1]), RANGE, extension=np.array(knots))
 
 
