@@ -57,11 +57,16 @@ from semcal_ros.core.wording import counted
 
 __all__ = [
     "LARGEST_STEP",
+    "LadderMeasurement",
     "LadderPicture",
     "LadderResult",
     "LadderStep",
     "RejectedPair",
+    "describe_ladder",
+    "describe_steps",
     "extend_calibration",
+    "make_model",
+    "measure_ladder",
 ]
 
 #: Largest ratio of neighbouring magnifications of a ladder: at 1.6 the upper picture covers 39 % of the lower one.
@@ -214,16 +219,70 @@ def extend_calibration(
     """
     _check_model(model)
     _check_ladder(model, pictures)
+    measured = measure_ladder(model, pictures, timing=timing, on_progress=on_progress)
+    setup, fit = measured.setup, measured.fit
+    extended = make_model(measured)
+    steps = describe_steps(measured)
+    tilt, tilt_sigma = _tilt(setup, fit)
+    weaknesses = _find_weaknesses(model, steps, extended)
+    notes = describe_ladder(measured) | {"warnings": list(weaknesses)}
+    extended = replace(extended, statistics={**model.statistics, "ladder": notes})
+    return LadderResult(
+        extended,
+        steps,
+        measured.rejected,
+        measured.unused,
+        tilt,
+        tilt_sigma,
+        _drift_px(fit) / measured.scale,
+        fit.variance_factor,
+        weaknesses,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LadderMeasurement:
+    """An adjusted ladder with what was measured in its pictures.
+
+    Attributes
+    ----------
+    setup, fit
+        The unknowns, and their values.
+    links
+        Correspondences of the pairs.
+    scale
+        Pixels of the calibration per pixel of the pictures.
+    rejected, unused
+        Pairs and names of pictures that were not used.
+    """
+
+    setup: LadderSetup
+    fit: LadderFit
+    links: tuple[Link, ...]
+    scale: float
+    rejected: tuple[RejectedPair, ...]
+    unused: tuple[str, ...]
+
+
+def measure_ladder(
+    model: CalibrationModel,
+    pictures: Sequence[LadderPicture],
+    *,
+    timing: ScanTiming | None = None,
+    on_progress: Callable[[str, int, int | None], object] = lambda _stage, _done, _total: None,
+) -> LadderMeasurement:
+    """Match the pictures of a ladder and adjust them; arguments and errors as of :func:`extend_calibration`."""
     scale = _scale_of_pictures(model, pictures)
     places = _places(pictures)
     setup = make_setup(model, tuple(places), (model.image_width, model.image_height))
-    matches, turns, rejected = _match_all(setup, pictures, scale, on_progress)
+    matches, rejected = _match_all(setup, pictures, scale, on_progress)
     used, unused = _check_connected(pictures, matches, rejected)
     number_of = {number: k for k, number in enumerate(used)}
     setup = make_setup(
         model, tuple(places[k] for k in used), (model.image_width, model.image_height)
     )
-    state = _start(setup, matches, number_of, turns, scale)
+    matches = [match for match in matches if match.first in number_of]
+    state = _start(setup, matches, number_of, scale)
     times = _Times(timing or ScanTiming(1.0), model.image_height, model.image_width)
     links = [_link(setup, match, number_of, scale, times) for match in matches]
     on_progress("adjusting", 0, None)
@@ -238,33 +297,22 @@ def extend_calibration(
         for k in left_out
     ]
     _check_fit(setup, fit, links)
-    growth = _estimate_growth(setup, fit, links)
-    extended = _make_model(setup, fit, growth)
-    steps = _describe(setup, fit, links, scale)
-    tilt, tilt_sigma = _tilt(setup, fit)
-    weaknesses = _find_weaknesses(model, steps, extended)
-    notes = {
-        "pictures": len(used),
+    names = tuple(pictures[k].name or f"picture {k}" for k in unused)
+    return LadderMeasurement(setup, fit, tuple(links), scale, tuple(rejected), names)
+
+
+def describe_ladder(measured: LadderMeasurement) -> dict[str, object]:
+    """What is written about a ladder for the readers of a calibration."""
+    setup, fit = measured.setup, measured.fit
+    return {
+        "pictures": len(setup.pictures),
         "pairs": len(fit.kept),
         "variance_factor": fit.variance_factor,
-        "drift_px": _drift_px(fit) / scale,
-        "tilt_rad": tilt,
+        "drift_px": _drift_px(fit) / measured.scale,
+        "tilt_rad": _tilt(setup, fit)[0],
         "relays": [[relay.low, relay.high, relay.jump] for relay in _relays(setup, fit)],
-        "magnifications": [step.magnification for step in steps],
-        "warnings": list(weaknesses),
+        "magnifications": sorted({picture.magnification for picture in setup.pictures}),
     }
-    extended = replace(extended, statistics={**model.statistics, "ladder": notes})
-    return LadderResult(
-        extended,
-        steps,
-        tuple(rejected),
-        tuple(pictures[k].name or f"picture {k}" for k in unused),
-        tilt,
-        tilt_sigma,
-        _drift_px(fit) / scale,
-        fit.variance_factor,
-        weaknesses,
-    )
 
 
 def _check_model(model: CalibrationModel) -> None:
@@ -372,18 +420,17 @@ def _match_all(
     pictures: Sequence[LadderPicture],
     scale: float,
     on_progress: Callable[[str, int, int | None], object],
-) -> tuple[list[_Match], dict[tuple[int, int], float], list[RejectedPair]]:
-    """Match all pairs that may overlap; the turns from the first to the second of those of unknown rotation, too."""
+) -> tuple[list[_Match], list[RejectedPair]]:
+    """Match all pairs that may overlap."""
     start = start_state(setup)
     cameras = [camera_of(start, k) for k in range(len(pictures))]
     prepared = [Prepared(np.asarray(p.image, dtype=np.float32)) for p in pictures]
     pairs = _candidates(pictures)
     matches: list[_Match] = []
-    turns: dict[tuple[int, int], float] = {}
     rejected: list[RejectedPair] = []
     for done, (first, second) in enumerate(pairs):
         on_progress("matching pictures", done, len(pairs))
-        best: tuple[float, Correspondences, float] | None = None
+        best: tuple[float, Correspondences] | None = None
         reason = ""
         for turn in _turns_to_try(pictures[first], pictures[second]):
             predict = _predictor(cameras[first], cameras[second], turn, scale)
@@ -394,7 +441,7 @@ def _match_all(
                 )
                 continue
             if best is None or found.correlation * np.sqrt(len(found)) > best[0]:
-                best = (found.correlation * float(np.sqrt(len(found))), found, turn)
+                best = (found.correlation * float(np.sqrt(len(found))), found)
             if found.correlation > 0.5:
                 break
         if best is None:
@@ -402,9 +449,8 @@ def _match_all(
             rejected.append(RejectedPair(*names, reason))
             continue
         matches.append(_Match(first, second, best[1]))
-        turns[first, second] = best[2]
     on_progress("matching pictures", len(pairs), len(pairs))
-    return matches, turns, rejected
+    return matches, rejected
 
 
 def _turns_to_try(first: LadderPicture, second: LadderPicture) -> tuple[float, ...]:
@@ -508,7 +554,6 @@ def _start(
     setup: LadderSetup,
     matches: Sequence[_Match],
     number_of: Mapping[int, int],
-    turns: Mapping[tuple[int, int], float],
     scale: float,
 ) -> LadderState:
     """Poses along the matches, from the first picture on."""
@@ -516,8 +561,6 @@ def _start(
     cameras = [camera_of(state, k) for k in range(len(setup.pictures))]
     near: dict[int, list[tuple[int, Array, Array]]] = {k: [] for k in range(len(setup.pictures))}
     for match in matches:
-        if match.first not in number_of or match.second not in number_of:
-            continue
         a, b = number_of[match.first], number_of[match.second]
         flat_a, flat_b = (
             cameras[k].sem_from_ideal(cameras[k].undistort(_calibrated_xy(xy, scale)))[:, :2]
@@ -635,8 +678,10 @@ def _relays(setup: LadderSetup, fit: LadderFit) -> tuple[Relay, ...]:
     return tuple(Relay(*setup.intervals[k], float(values[k]) / level) for k in sorted(fit.jumps))
 
 
-def _make_model(setup: LadderSetup, fit: LadderFit, growth: float) -> CalibrationModel:
-    model = setup.model
+def make_model(measured: LadderMeasurement) -> CalibrationModel:
+    """The calibration that a ladder was measured with, extended by it."""
+    setup, fit, model = measured.setup, measured.fit, measured.setup.model
+    growth = _estimate_growth(setup, fit, measured.links)
     functions_part = setup.bounds[2].stop
     columns = setup.theta_columns
     theta = fit.state.theta
@@ -689,9 +734,9 @@ def _with_field(setup: LadderSetup, fit: LadderFit, columns: Array, functions: A
     return np.block([[functions, new_cross], [new_cross.T, field]])
 
 
-def _describe(
-    setup: LadderSetup, fit: LadderFit, links: Sequence[Link], scale: float
-) -> tuple[LadderStep, ...]:
+def describe_steps(measured: LadderMeasurement) -> tuple[LadderStep, ...]:
+    """What a ladder has at each of its magnifications, ascending."""
+    setup, fit, links, scale = measured.setup, measured.fit, measured.links, measured.scale
     levels = sorted({picture.magnification for picture in setup.pictures})
     squares: dict[float, list[Array]] = {g: [] for g in levels}
     own, below = dict.fromkeys(levels, 0), dict.fromkeys(levels, 0)
