@@ -234,11 +234,11 @@ def _most_likely_drift(
 ) -> DriftSpread:
     """The spread of the drift that makes the correspondences most likely, whatever the unknowns are.
 
-    Minus twice the logarithm of the marginal likelihood is, but for a constant, -b' H^-1 b + log det H - log det P,
-    with the equations ``H x = b`` with the prior ``P``. Another spread moves the unknowns by little, so that the
-    equations of the pictures stay as they are. All spreads are tried, since there may be more than one minimum.
+    Minus twice the logarithm of the marginal likelihood is, but for a constant, x' P x - g' H^-1 g + log det H
+    - log det P, with the prior ``P``, the equations ``H`` with it, and the gradient ``g`` at the state ``x``. Another
+    spread moves the unknowns by little, so that the equations of the pictures stay as they are. All spreads are tried,
+    since there may be more than one minimum.
     """
-    wanted = right + matrix @ state.values
     most = _MOST_DRIFT * setup.image_size[1]
     spreads = np.geomspace(_LEAST_DRIFT_PX, most, _SPREADS).tolist()
     # Without a turned scan a steady drift is a stretch of the camera, and its spread is that of the changes.
@@ -250,9 +250,11 @@ def _most_likely_drift(
             information = prior_information(setup, drift, jumps)
             scaled, scale = equilibrate(matrix + np.diag(information))
             factor = np.linalg.cholesky(scaled)
-            half = solve_triangular(factor, scale * wanted, lower=True)
+            gradient = right - information * state.values
+            half = solve_triangular(factor, scale * gradient, lower=True)
             cost = 2.0 * float(np.sum(np.log(np.diag(factor))) - np.sum(np.log(scale)))
-            cost -= float(half @ half) + float(np.sum(np.log(information[information > 0.0])))
+            cost += float(state.values**2 @ information) - float(half @ half)
+            cost -= float(np.sum(np.log(information[information > 0.0])))
             if cost < least:
                 best, least = drift, cost
     return best

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -153,7 +154,7 @@ def calibrate_from_specimen(
             expected=f"{_LEAST_MAGNIFICATIONS} or more, in steps of at most {LARGEST_STEP:g}",
             do="record more, or take a grid",
         )
-    for below, above in zip(seen[:-1], seen[1:], strict=True):
+    for below, above in pairwise(seen):
         if above > LARGEST_STEP * _ROUNDING * below:
             raise CalibrationError(
                 f"a gap from {below:g}x to {above:g}x, a factor of {above / below:.2f}",

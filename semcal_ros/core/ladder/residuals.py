@@ -17,6 +17,9 @@
 A place that picture i shows at the raw pixel u_i is found on the specimen by Newton's method, and projected into
 picture j; the residual is the pixel u_j at which it was found there minus that. Derivatives go through the analytic
 Jacobians of the camera, the place on the specimen as an implicit function: dx = -(du_i/dx)^-1 du_i/dq.
+
+The time at which picture j shows the place is that of the pixel where it is predicted. At the pixel where it was found,
+which has noise, a drift along the frame would explain a part of that noise, and the likelihood would prefer one.
 """
 
 from __future__ import annotations
@@ -47,6 +50,8 @@ __all__ = [
     "place_on_specimen",
 ]
 
+# A drift by a tenth of the picture in a frame, which is the most, leaves a ten-thousandth of the way.
+_TIME_STEPS = 5
 # Newton's method converges quadratically, from a start that is exact without a slope.
 _STEPS = 2
 
@@ -63,6 +68,8 @@ class Link:
         (n, 2) raw pixels without the residual field.
     first_time, second_time
         (n,) times of these pixels, from -1/2 to 1/2 of their frames.
+    time_slope
+        (2,) change of the time along x and y of the second picture, per px.
     weight
         (n, 2, 2) matrices with which residuals have the variance one.
     """
@@ -73,6 +80,7 @@ class Link:
     second_xy: Array
     first_time: Array
     second_time: Array
+    time_slope: Array
     weight: Array
 
     def __len__(self) -> int:
@@ -116,9 +124,11 @@ def make_link(
             xy = xy + raster.norm_px * field.displacement(q)
         points.append(xy)
     root = np.linalg.cholesky(np.linalg.inv(covariance))
-    return Link(
-        *numbers, points[0], points[1], time_of[0], time_of[1], np.swapaxes(root, 1, 2).copy()
-    )
+    # Times are linear in the pixels.
+    offset = points[1] - points[1].mean(axis=0)
+    slope = np.linalg.lstsq(offset, time_of[1] - time_of[1].mean(), rcond=None)[0]
+    weight = np.swapaxes(root, 1, 2).copy()
+    return Link(*numbers, points[0], points[1], time_of[0], time_of[1], slope, weight)
 
 
 def field_of(setup: LadderSetup, magnification: float) -> FieldSlice | None:
@@ -148,9 +158,12 @@ def _turn(angle: float) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Pixels of places, with derivatives by the place, the parameters of the camera, and pose and slope."""
+    """Pixels of places, with derivatives by the sem frame, the place, the parameters of the camera, pose, slope and
+    drift.
+    """
 
     xy: Array
+    by_flat: Array
     by_place: Array
     by_camera: Array
     by_pose: Array
@@ -176,7 +189,7 @@ def _see(state: LadderState, picture: int, places: Array, time: Array) -> _Seen:
     by_pose[:, :, 3:5] = pixel * time[:, None, None] * by_flat
     by_slope = by_height[:, :, None] * places[:, None, :]
     by_drift = pixel * time[:, None, None] * (by_flat @ turn)
-    return _Seen(seen.xy, by_place, seen.d_parameters, by_pose, by_slope, by_drift)
+    return _Seen(seen.xy, by_flat, by_place, seen.d_parameters, by_pose, by_slope, by_drift)
 
 
 def _in_sem_frame(state: LadderState, picture: int, places: Array, time: Array) -> Array:
@@ -206,9 +219,38 @@ def place_on_specimen(state: LadderState, picture: int, xy: Array, time: Array) 
 def pair_values(state: LadderState, link: Link) -> Array:
     """(2 n,) residuals of a link over their sigmas, observed minus predicted."""
     places = place_on_specimen(state, link.first, link.first_xy, link.first_time)
-    xyz = _in_sem_frame(state, link.second, places, link.second_time)
-    seen = project_points(state.parameters[link.second], xyz, Raster.of(*state.setup.image_size))
+    seen, _ = _predict(state, link, places)
     return np.einsum("nij,nj->ni", link.weight, link.second_xy - seen).reshape(-1)
+
+
+def _predict(state: LadderState, link: Link, places: Array) -> tuple[Array, Array]:
+    """Pixels (n, 2) of the second picture where places are seen, and their times (n,)."""
+    parameters, raster = state.parameters[link.second], Raster.of(*state.setup.image_size)
+    time = link.second_time
+    for _ in range(_TIME_STEPS):
+        xyz = _in_sem_frame(state, link.second, places, time)
+        seen = project_points(parameters, xyz, raster)
+        before, time = time, link.second_time + (seen - link.second_xy) @ link.time_slope
+    return seen, before
+
+
+def _follow_time(state: LadderState, link: Link, seen: _Seen) -> _Seen:
+    """The same with derivatives that contain that of the time by the pixel: (I - du/dX drift dtau/du) du = ..."""
+    setup, number = state.setup, link.second
+    turn, _ = _turn(float(state.poses[number, 0]))
+    pixel = setup.pixel_m(setup.pictures[number].magnification)
+    drift = pixel * (turn @ state.drifts[number] + state.poses[number, 3:5])
+    moved = np.einsum("nij,j->ni", seen.by_flat, drift)
+    by = np.linalg.inv(np.eye(2) - moved[:, :, None] * link.time_slope)
+    parts = (
+        seen.by_flat,
+        seen.by_place,
+        seen.by_camera,
+        seen.by_pose,
+        seen.by_slope,
+        seen.by_drift,
+    )
+    return _Seen(seen.xy, *(by @ part for part in parts))
 
 
 def pair_rows(state: LadderState, link: Link) -> PairRows:
@@ -216,7 +258,8 @@ def pair_rows(state: LadderState, link: Link) -> PairRows:
     setup, first, second = state.setup, link.first, link.second
     places = place_on_specimen(state, first, link.first_xy, link.first_time)
     here = _see(state, first, places, link.first_time)
-    there = _see(state, second, places, link.second_time)
+    _, time = _predict(state, link, places)
+    there = _follow_time(state, link, _see(state, second, places, time))
     # By the place in the first picture: how the second pixel follows a change of the first one.
     follow = -there.by_place @ np.linalg.inv(here.by_place)
     functions = setup.theta_columns
