@@ -16,10 +16,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import PATH, output_option
 from semcal_ros.cli.output import (
     echo_json,
@@ -30,12 +32,12 @@ from semcal_ros.cli.output import (
 )
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.ladder.extend import LadderResult
-from semcal_ros.core.wording import counted
+from semcal_ros.core.ladder.extend import LadderStep, RejectedPair
+from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.extend import RecordingExtension, extend
 
-__all__ = ["command"]
+__all__ = ["command", "echo_pairs", "echo_steps"]
 
 # Pairs that were left out, and are named.
 _MOST_NAMED = 3
@@ -71,22 +73,24 @@ def command(
         echo_json(_plain(done))
         return
     echo_verdict(done.calibration)
-    _echo_steps(done.calibration.magnification_range, done)
-    for weakness in done.result.weaknesses:
-        click.echo(f"note: {weakness}", err=True)
-    echo_notes(done.notes)
-    _echo_rejected(done.result)
-    click.echo(f"calibration: {output}")
-
-
-def _echo_steps(whole: tuple[float, float], done: RecordingExtension) -> None:
-    result, calibration = done.result, done.calibration
-    ladder = calibration.ladder
+    ladder, whole = done.calibration.ladder, done.calibration.magnification_range
     assert ladder is not None
     low, high = ladder.anchored
     click.echo(f"range: {whole[0]:g}x to {whole[1]:g}x, of which {low:g}x to {high:g}x by the grid")
+    echo_steps(done.calibration, done.result.steps)
+    last = done.result.steps[-1].magnification
+    click.echo(f"drift within a frame at {last:g}x: {done.result.drift_px:.2f} px (1-sigma)")
+    for weakness in done.result.weaknesses:
+        click.echo(f"note: {weakness}", err=True)
+    echo_notes(done.notes)
+    echo_pairs(done.result.rejected, done.result.unused)
+    click.echo(f"calibration: {output}")
+
+
+def echo_steps(calibration: Calibration, steps: Sequence[LadderStep]) -> None:
+    """Print what a ladder has at each magnification, and how well nm per pixel is known there."""
     rows = []
-    for step in result.steps:
+    for step in steps:
         camera = calibration.at(step.magnification)
         size, sigma = camera.rectified.pixel_size_m[0], max(camera.rectified.pixel_size_sigma_m)
         rows.append(
@@ -103,18 +107,16 @@ def _echo_steps(whole: tuple[float, float], done: RecordingExtension) -> None:
     echo_table(
         ["magnification", "pictures", "turned", "pairs", "RMS px", "nm per px", "1-sigma"], rows
     )
-    click.echo(
-        f"drift within a frame at {result.steps[-1].magnification:g}x: {result.drift_px:.2f} px (1-sigma)"
-    )
 
 
-def _echo_rejected(result: LadderResult) -> None:
-    if result.unused:
-        listed = ", ".join(result.unused[:_MOST_NAMED])
-        click.echo(f"not used: {counted(len(result.unused), 'picture')}: {listed}", err=True)
+def echo_pairs(rejected: Sequence[RejectedPair], unused: Sequence[str]) -> None:
+    """Print which pictures and pairs were not used, each reason once."""
+    if unused:
+        listed = ", ".join(unused[:_MOST_NAMED])
+        click.echo(f"not used: {counted(len(unused), 'picture')}: {listed}", err=True)
     kinds: dict[str, list[str]] = {}
-    for pair in result.rejected:
-        kinds.setdefault(pair.reason, []).append(f"{pair.first} with {pair.second}")
+    for pair in rejected:
+        kinds.setdefault(omit_numbers(pair.reason), []).append(f"{pair.first} with {pair.second}")
     for reason, pairs in kinds.items():
         more = f" and {len(pairs) - _MOST_NAMED} more" if len(pairs) > _MOST_NAMED else ""
         click.echo(f"not matched: {', '.join(pairs[:_MOST_NAMED])}{more}: {reason}", err=True)

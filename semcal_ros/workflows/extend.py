@@ -22,6 +22,7 @@ import numpy as np
 
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.ladder.extend import LadderPicture, LadderResult, extend_calibration
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.conditions import ConditionsComparison
@@ -38,7 +39,7 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.provenance import describe_provenance
 
-__all__ = ["RecordingExtension", "extend"]
+__all__ = ["RecordingExtension", "SeenLadder", "extend", "read_ladder"]
 
 # Digits of a magnification: the same setting is the same number, however a file rounds it.
 _DIGITS = 9
@@ -101,7 +102,38 @@ def extend(
     """
     model = require_calibration(calibration)
     microscope = resolve_config(config, model)
-    conditions = ConditionsComparison(model)
+    seen = read_ladder(source, microscope, model, on_progress)
+    result = extend_calibration(
+        model, seen.pictures, timing=microscope.scan, on_progress=on_progress
+    )
+    provenance = describe_provenance(source, microscope, seen.frames)
+    extended = Calibration.from_model(replace(result.model, provenance=provenance))
+    return RecordingExtension(extended, result, seen.notes)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLadder:
+    """Pictures of a recording, the frames without their pixels by name, and notes for the user."""
+
+    pictures: tuple[LadderPicture, ...]
+    frames: dict[str, RecordedFrame]
+    notes: tuple[str, ...]
+
+
+def read_ladder(
+    source: Source,
+    microscope: MicroscopeConfig,
+    calibration: Calibration | None,
+    on_progress: OnProgress,
+) -> SeenLadder:
+    """Read the pictures of a ladder; the notes compare their conditions with those of a calibration.
+
+    Raises
+    ------
+    SemcalError
+        If the recording cannot be read.
+    """
+    conditions = ConditionsComparison(calibration)
     frames: dict[str, RecordedFrame] = {}
     pictures = []
     with open_source(source, microscope) as opened:
@@ -113,10 +145,7 @@ def extend(
             frames[name] = replace(frame, image=frame.image[:0])
             advance(1)
         notes = (*opened.notes, *conditions.notes)
-    result = extend_calibration(model, pictures, timing=microscope.scan, on_progress=on_progress)
-    provenance = describe_provenance(source, microscope, frames)
-    extended = Calibration.from_model(replace(result.model, provenance=provenance))
-    return RecordingExtension(extended, result, notes)
+    return SeenLadder(tuple(pictures), frames, notes)
 
 
 def _picture(frame: RecordedFrame, name: str) -> LadderPicture:

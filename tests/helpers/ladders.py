@@ -36,6 +36,7 @@ from tests.helpers.made_once import made_once
 __all__ = [
     "REPEATABILITY",
     "SIZE",
+    "aligned_rms_px",
     "calibration_of",
     "camera_at",
     "ladder_of",
@@ -147,3 +148,15 @@ def place_in(
     x, y = scope.metres(g, xy[:, 0], xy[:, 1])
     c, s, field = math.cos(turn_rad), math.sin(turn_rad), scope.display_m / g
     return np.stack([c * x + s * y + field * place[0], -s * x + c * y + field * place[1]], axis=1)
+
+
+def aligned_rms_px(model: CalibrationModel, scope: Scope, g: float) -> float:
+    """RMS distance, px, of a model from the truth after the best shift, turn and scale."""
+    x, y = np.meshgrid(np.linspace(5, SIZE - 6, 9), np.linspace(5, SIZE - 6, 9))
+    xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    camera = model.at(g)
+    found = camera.sem_from_ideal(camera.undistort(xy))[:, :2] @ [1.0, 1j]
+    truth = np.stack(scope.metres(g, *xy.T), axis=1) @ [1.0, 1j]
+    found, truth = found - found.mean(), truth - truth.mean()
+    factor = np.vdot(truth, found) / np.vdot(truth, truth)
+    return float(np.sqrt(np.mean(np.abs(found - factor * truth) ** 2))) * camera.m

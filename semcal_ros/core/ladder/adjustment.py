@@ -22,7 +22,7 @@ looked for where none is expected: by how much the cost would fall if it were fr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -45,7 +45,7 @@ from semcal_ros.core.ladder.unknowns import (
     slope_sigma,
 )
 
-__all__ = ["DriftSpread", "LadderFit", "add_up", "adjust", "prior_information"]
+__all__ = ["DriftSpread", "LadderFit", "add_up", "adjust", "prior_information", "share_noise"]
 
 # Gauss-Newton steps; from the poses of the correspondences five are enough.
 _ITERATIONS, _TOLERANCE = 30, 1e-9
@@ -144,16 +144,42 @@ def prior_information(setup: LadderSetup, drift: DriftSpread, jumps: tuple[int, 
     return information
 
 
+def share_noise(setup: LadderSetup, links: Sequence[Link]) -> list[Link]:
+    """Give links the share of what they tell.
+
+    The noise of a picture is in all of its links. Of n pictures of one place, each with the variance one, the
+    n (n - 1)/2 differences with the variance two, taken for independent, would tell as much as n (n - 1)/4 of them; the
+    pictures tell as much as n - 1. So each difference counts by 4/n, where n pictures see a place.
+    """
+    full = max(len(link) for link in links)
+    covered = np.ones(len(setup.pictures))
+    for link in links:
+        for number, area in zip((link.first, link.second), _areas(setup, link), strict=True):
+            covered[number] += min(len(link) * area / full, 1.0)
+    return [
+        replace(link, share=min(8.0 / float(covered[link.first] + covered[link.second]), 1.0))
+        for link in links
+    ]
+
+
+def _areas(setup: LadderSetup, link: Link) -> tuple[float, float]:
+    """How much larger a block is in either picture than in the coarser one, by area."""
+    first, second = (setup.pictures[k].magnification for k in (link.first, link.second))
+    return 1.0, (second / first) ** 2
+
+
 def add_up(state: LadderState, links: Sequence[Link]) -> tuple[Array, Array, Array]:
-    """Normal matrix (N, N), right-hand side (N,) and sum of squares of each link, without priors."""
+    """Normal matrix (N, N) and right-hand side (N,), with the shares of the links and without priors; and (L,) the
+    sums of squares of the links.
+    """
     size = state.setup.size
     matrix, right = np.zeros((size, size)), np.zeros(size)
     squares = np.empty(len(links))
     for number, link in enumerate(links):
         rows = pair_rows(state, link)
         at = np.ix_(rows.columns, rows.columns)
-        matrix[at] += rows.jacobian.T @ rows.jacobian
-        right[rows.columns] += rows.jacobian.T @ rows.values
+        matrix[at] += link.share * (rows.jacobian.T @ rows.jacobian)
+        right[rows.columns] += link.share * (rows.jacobian.T @ rows.values)
         squares[number] = rows.values @ rows.values
     return matrix, right, squares
 
@@ -175,7 +201,7 @@ def adjust(
     kept = tuple(range(len(links)))
     drift = DriftSpread(_FIRST_DRIFT_PX, _FIRST_DRIFT_PX)
     while True:
-        used = [links[k] for k in kept]
+        used = share_noise(setup, [links[k] for k in kept])
         state, drift, descent = _settle(setup, state, used, drift, jumps)
         on_progress(len(jumps) + 1)
         matrix, right, squares = add_up(state, used)
@@ -281,7 +307,9 @@ def _descend(
 
     def cost_of(candidate: LadderState) -> float:
         with np.errstate(all="ignore"):
-            total = sum(float(np.sum(pair_values(candidate, link) ** 2)) for link in links)
+            total = sum(
+                link.share * float(np.sum(pair_values(candidate, link) ** 2)) for link in links
+            )
         prior = float(candidate.values**2 @ information)
         cost = 0.5 * (total + prior)
         return cost if np.isfinite(cost) else float("inf")

@@ -45,7 +45,13 @@ from semcal_ros.core.ladder.extend import (
     measure_ladder,
 )
 
-__all__ = ["METHOD", "ScaleAnchor", "SpecimenCalibration", "calibrate_from_specimen"]
+__all__ = [
+    "METHOD",
+    "KnownLength",
+    "ScaleAnchor",
+    "SpecimenCalibration",
+    "calibrate_from_specimen",
+]
 
 #: The method of the calibration, as its file says it.
 METHOD = "specimen"
@@ -69,6 +75,8 @@ _SLOPES = {
 _HELD = 1e-6
 # Principal point, in image widths, and pivot (1/m), which flat pictures do not show: as in a calibration by a grid.
 _PRINCIPAL_POINT, _PIVOT, _PIVOT_SIGMA = 0.08, 50.0, 60.0
+# A place that is pointed at by hand is known to half a pixel; a length of fewer pixels than these says too little.
+_EDGE_SIGMA_PX, _LEAST_LENGTH_PX = 0.5, 20.0
 # How well a magnification comes back where nothing tells it, and the height of what is measured, m: as there.
 _REPEATABILITY, _HEIGHT_M = 1e-3, 1e-5
 
@@ -98,6 +106,58 @@ class ScaleAnchor:
             check_range(self.sigma, "relative 1-sigma of a pixel size", 1e-6, 0.2)
 
 
+@dataclass(frozen=True)
+class KnownLength:
+    """A known length between two pixels of a picture.
+
+    Attributes
+    ----------
+    length_m
+        The length.
+    picture
+        Number of the picture.
+    start_xy, end_xy
+        The raw pixels.
+    sigma
+        Relative 1-sigma of the length itself.
+    """
+
+    length_m: float
+    picture: int
+    start_xy: tuple[float, float]
+    end_xy: tuple[float, float]
+    sigma: float
+
+    def __post_init__(self) -> None:
+        check_positive(self.length_m, "length", "m")
+        if self.pixels < _LEAST_LENGTH_PX:
+            raise InvalidValueError(
+                f"a length of {self.pixels:.3g} px",
+                expected=f"{_LEAST_LENGTH_PX:g} px or more",
+                do="choose two places farther apart",
+            )
+
+    @property
+    def pixels(self) -> float:
+        """Distance of both, px."""
+        return float(np.hypot(*np.subtract(self.end_xy, self.start_xy)))
+
+    def as_anchor(self, model: CalibrationModel, magnification: float) -> ScaleAnchor:
+        """The pixel size that the length means, by the distortion of a calibration of another scale."""
+        camera = model.at(magnification)
+        ends = camera.sem_from_ideal(camera.undistort([self.start_xy, self.end_xy]))[:, :2]
+        seen_m = float(np.hypot(*(ends[1] - ends[0])))
+        if not np.isfinite(seen_m):
+            raise InvalidValueError(
+                f"a length from pixel {self.start_xy} to {self.end_xy}",
+                expected="pixels of the picture",
+            )
+        edges = np.sqrt(2.0) * _EDGE_SIGMA_PX / self.pixels
+        return ScaleAnchor(
+            self.length_m / seen_m / camera.m, magnification, float(np.hypot(self.sigma, edges))
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class SpecimenCalibration:
     """A calibration without a grid.
@@ -121,7 +181,7 @@ class SpecimenCalibration:
 
 def calibrate_from_specimen(
     pictures: Sequence[LadderPicture],
-    anchor: ScaleAnchor,
+    known: ScaleAnchor | KnownLength,
     *,
     display_width_m: float,
     timing: ScanTiming | None = None,
@@ -133,8 +193,8 @@ def calibrate_from_specimen(
     ----------
     pictures
         As for :func:`.extend_calibration`, at three magnifications or more.
-    anchor
-        One known pixel size, at a magnification within the range of the pictures.
+    known
+        One known pixel size, at a magnification within the range of the pictures, or a known length in one of them.
     display_width_m
         Display width that magnifications refer to.
     timing, on_progress
@@ -161,6 +221,17 @@ def calibrate_from_specimen(
                 expected=f"steps of at most {LARGEST_STEP:g}",
                 do=f"record pictures at {np.sqrt(below * above):.0f}x, too",
             )
+    if isinstance(known, ScaleAnchor):
+        anchor = known
+    else:
+        if not 0 <= known.picture < len(pictures):
+            raise InvalidValueError(
+                f"a length in picture {known.picture} of {len(pictures)}",
+                expected=f"0 to {len(pictures) - 1}",
+            )
+        at = pictures[known.picture].magnification
+        # Any scale: the length corrects it when the distortion is known.
+        anchor = ScaleAnchor(display_width_m / at / pictures[0].image.shape[1], at, known.sigma)
     if not seen[0] * (1 - 1e-6) <= anchor.magnification <= seen[-1] * (1 + 1e-6):
         raise InvalidValueError(
             f"a pixel size at {anchor.magnification:g}x for pictures from {seen[0]:g}x to {seen[-1]:g}x",
@@ -168,7 +239,10 @@ def calibrate_from_specimen(
         )
     start = _unknown_microscope(pictures[0].image.shape, seen, anchor, display_width_m)
     measured = measure_ladder(start, pictures, timing=timing, on_progress=on_progress)
-    model = _anchored(make_model(measured), anchor)
+    model = make_model(measured)
+    if isinstance(known, KnownLength):
+        anchor = known.as_anchor(model, anchor.magnification)
+    model = _anchored(model, anchor)
     steps = describe_steps(measured)
     weaknesses = _find_weaknesses(steps, anchor, model)
     notes = describe_ladder(measured) | {"warnings": list(weaknesses)}

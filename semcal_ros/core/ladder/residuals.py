@@ -72,6 +72,8 @@ class Link:
         (2,) change of the time along x and y of the second picture, per px.
     weight
         (n, 2, 2) matrices with which residuals have the variance one.
+    share
+        Part of what these tell that no other link tells: pictures that are in several links bring their noise to all.
     """
 
     first: int
@@ -82,6 +84,7 @@ class Link:
     second_time: Array
     time_slope: Array
     weight: Array
+    share: float = 1.0
 
     def __len__(self) -> int:
         return len(self.first_xy)

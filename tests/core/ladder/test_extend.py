@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
+from semcal_ros.core.camera.calibration_model import ScaleSigma
 from semcal_ros.core.camera.uncertainty_budget import budget_of_pixel_size
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.adjustment import adjust
@@ -36,6 +36,7 @@ from semcal_ros.core.ladder.residuals import Link, make_link
 from semcal_ros.core.ladder.unknowns import LadderState, PicturePlace, make_setup, start_state
 from tests.helpers.ladders import (
     SIZE,
+    aligned_rms_px,
     calibration_of,
     camera_at,
     ladder_of,
@@ -46,19 +47,6 @@ from tests.helpers.ladders import (
 
 STEPS = (5000.0, 7400.0, 11000.0, 16000.0)
 RELAY = (13000.0, 0.005)
-
-
-def _shapes_agree(model: CalibrationModel, g: float, relay: tuple[float, float] | None) -> float:
-    """RMS, px, of the model after the best shift, turn and scale."""
-    scope = make_scope(1, relay)
-    x, y = np.meshgrid(np.linspace(5, SIZE - 6, 9), np.linspace(5, SIZE - 6, 9))
-    xy = np.stack([x.ravel(), y.ravel()], axis=1)
-    camera = model.at(g)
-    found = camera.sem_from_ideal(camera.undistort(xy))[:, :2] @ [1.0, 1j]
-    truth = np.stack(scope.metres(g, *xy.T), axis=1) @ [1.0, 1j]
-    found, truth = found - found.mean(), truth - truth.mean()
-    factor = np.vdot(truth, found) / np.vdot(truth, truth)
-    return float(np.sqrt(np.mean(np.abs(found - factor * truth) ** 2))) * camera.m
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +64,7 @@ def test_pixel_sizes_and_distortion_between_the_steps(extended: LadderResult) ->
         size, wanted = np.array(camera.pixel_size_m), np.array(truth.pixel_size_m)
         assert np.all(np.abs(size - wanted) < 3.0 * np.array(camera.pixel_size_sigma_m))
         # Pictures of 256 px place a block to 0.1 px, some 30 blocks a pair: the shape is known to some hundredths.
-        assert _shapes_agree(extended.model, g, RELAY) < 0.05
+        assert aligned_rms_px(extended.model, scope, g) < 0.05
     # Inside the grid nothing is worse than before.
     before, after = calibration_of(scope).at(6000.0), extended.model.at(6000.0)
     assert max(after.pixel_size_sigma_m) <= max(before.pixel_size_sigma_m) * 1.001
