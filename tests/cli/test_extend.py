@@ -26,6 +26,7 @@ from semcal_ros import Calibration, extend
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import preset
 from tests.helpers.calibrations import calibrated
+from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run
 
 
@@ -89,26 +90,54 @@ def test_a_rotation_that_nobody_says_is_found(folder: Path) -> None:
     assert [step.turned for step in done.result.steps] == [1, 1]
 
 
-@pytest.mark.slow
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """A calibration of 500x to 8000x, of images of 96 px."""
+    make_calibration().save(tmp_path / "cal.yaml")
+    return tmp_path
+
+
 def test_what_cannot_be_extended_is_refused_in_a_line(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    small: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = ("simulate", folder / "steps", "--plan", "steps", "--frames", 1, "--specimen", "gold")
-    gap = ("--magnification", 8000, "--magnification", 16000, "--size", 128)
+    made = ("simulate", small / "steps", "--plan", "steps", "--frames", 1, "--specimen", "gold")
+    gap = ("--magnification", 7000, "--magnification", 14000, "--size", 96)
     assert run(*made, *gap) == 0
-    said = refused(capsys, "extend", folder / "cal.yaml", folder / "steps", "-o", folder / "n.yaml")
-    assert "a gap in the ladder from 8000x to 16000x" in said
-    assert not (folder / "n.yaml").exists()
+    capsys.readouterr()
+    said = refused(capsys, "extend", small / "cal.yaml", small / "steps", "-o", small / "n.yaml")
+    assert "a gap in the ladder from 7000x to 14000x" in said
+    assert not (small / "n.yaml").exists()
 
 
-@pytest.mark.slow
-def test_plan_lists_a_ladder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("plan", folder / "cal.yaml", "--extend", "100000x") == 0
+def test_plan_lists_a_ladder(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("plan", small / "cal.yaml", "--extend", "100000x") == 0
     out = capsys.readouterr().out
     assert "100000" in out and "+90 deg" in out
-    assert run("plan", folder / "cal.yaml", "--extend", "100000x", "--json") == 0
+    assert run("plan", small / "cal.yaml", "--extend", "100000x", "--json") == 0
     steps = json.loads(capsys.readouterr().out)
     assert steps[-1]["magnification"] == 100000.0
     for wrong in ((), ("--extend", "3000x", "--target", "0.1%")):
-        assert "expected one of the two" in refused(capsys, "plan", folder / "cal.yaml", *wrong)
-    assert "magnification such as" in refused(capsys, "plan", folder / "cal.yaml", "--extend", "k")
+        assert "expected one of the two" in refused(capsys, "plan", small / "cal.yaml", *wrong)
+    assert "magnification such as" in refused(capsys, "plan", small / "cal.yaml", "--extend", "k")
+
+
+def test_without_a_grid_one_size_is_known(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = ("simulate", small / "steps", "--plan", "steps", "--frames", 1, "--specimen", "gold")
+    assert run(*made, "--magnification", 7000, "--magnification", 10000, "--size", 96) == 0
+    capsys.readouterr()
+    common = ("calibrate", small / "steps", "-o", small / "n.yaml", "--specimen")
+    for wrong, said in (
+        ((), "without a known size"),
+        (("--pixel-size", "9nm@7000", "--length", "1um@0,1,1,60,60"), "two known sizes"),
+        (("--pixel-size", "9nm@x"), "not a pixel size such as"),
+        (("--length", "1um@0,1,1"), "not a length such as"),
+        (("--pixel-size", "9nm@7000", "--method", "pda"), "--method with --specimen"),
+        (("--pixel-size", "9nm@7000", "--untilted", "all"), "--untilted"),
+        (("--pixel-size", "9nm@7000"), "pictures at 2 magnifications"),
+    ):
+        assert said in refused(capsys, *common, *wrong)
+    plain = ("drift", small / "steps", "-o", small / "d.csv")
+    assert "only calibrate --specimen" in refused(capsys, *plain, "--pixel-size", "9nm@7000")
+    assert "--length without --specimen" in refused(
+        capsys, *common[:4], "--length", "1um@0,1,1,60,60"
+    )
