@@ -62,6 +62,9 @@ def test_extend_writes_a_calibration_that_reaches_farther(
     # Programs that ask for a magnification get it as everywhere.
     assert run("at", new, 15000, "--budget") == 0
     assert "steps of the ladder beyond the grid" in capsys.readouterr().out
+    assert run("info", new) == 0
+    assert "origin" in (out := capsys.readouterr().out)
+    assert "100x to 10000x a grid, the rest a specimen" in out
     assert run("extend", folder / "cal.yaml", folder / "ladder", "-o", new, "--json") == 0
     said = json.loads(capsys.readouterr().out)
     assert said["grid_range"] == [100.0, 10000.0]
