@@ -57,7 +57,7 @@ _SPREADS, _SPREAD_ROUNDS = 12, 3
 _TURNED_RAD = 0.5
 # Vibration stretches a frame by this at any magnification, px.
 _LEAST_CHANGE_PX = 0.01
-# A jump must lower twice the cost by this: of 12 places without one, 3 in 10 000 do so by chance.
+# A jump must lower twice the cost by this: by chance, one of 12 places does so in 1 of 10 000 ladders.
 _JUMP_GAIN = 20.0
 _MOST_JUMPS = 4
 # The first picture has its place: its turn (rad) and shift (px) are fixed to these.

@@ -64,8 +64,8 @@ POSE_SIZE = 5
 # Pictures of a flat specimen from above tell nothing of these.
 _UNSEEN = ("px", "py", "rho")
 # Least 1-sigma of the second derivatives by log g: relative, in normalised coordinates, or, for centres, in image
-# widths. Over a step of 1.5 each of them bends the edge of 1024 px by 0.15 px, and the functions of the microscopes
-# that were published bend by less.
+# widths. Over a step of 1.5 each of them bends the edge of 1024 px by 0.15 px, and the functions of the virtual
+# JSM-820 bend by less.
 _LEAST_BEND = {"scale": 4e-3, "aspect": 4e-3, "skew": 4e-3, "ex": 0.02, "ey": 0.02}
 _LEAST_BEND_OTHERS = 4e-3
 # The functions may bend by twice as much as they do where they are known.
