@@ -62,6 +62,7 @@ __all__ = [
     "LadderResult",
     "LadderStep",
     "RejectedPair",
+    "check_fit",
     "describe_ladder",
     "describe_steps",
     "extend_calibration",
@@ -75,7 +76,7 @@ LARGEST_STEP = 1.6
 _ROUNDING = 1.02
 # Scans of unknown rotation are tried at these.
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
-# Relative slope of a specimen that is not flat any more: 5 degrees, ten times what the prior allows.
+# Slope of a specimen that is not flat any more: 5 degrees, ten times that of one that is mounted flat.
 _STEEPEST_RAD = 0.0873
 # Residuals of twice their sigma are a model that does not fit, or pictures that do not show one plane.
 _LARGEST_FACTOR = 9.0
@@ -296,7 +297,7 @@ def measure_ladder(
         )
         for k in left_out
     ]
-    _check_fit(setup, fit, links)
+    check_fit(setup, fit, links)
     names = tuple(pictures[k].name or f"picture {k}" for k in unused)
     return LadderMeasurement(setup, fit, tuple(links), scale, tuple(rejected), names)
 
@@ -612,7 +613,14 @@ def _tilt(setup: LadderSetup, fit: LadderFit) -> tuple[float, float]:
     return float(np.hypot(*values)), float(spread)
 
 
-def _check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None:
+def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None:
+    """Refuse a ladder whose specimen is tilted, or whose pictures do not show one plane at rest.
+
+    Raises
+    ------
+    CalibrationError
+        With what was seen.
+    """
     tilt, sigma = _tilt(setup, fit)
     if tilt > _STEEPEST_RAD and tilt > 3.0 * sigma:
         raise CalibrationError(

@@ -74,7 +74,9 @@ _BEND_FACTOR = 2.0
 JUMP_SIGMA, _NO_JUMP = 0.03, 1e-9
 # Of the largest eigenvalue of a matrix of correlations: what is below is rounding.
 _SINGULAR = 1e-13
-_SLOPE_SIGMA_RAD = 0.0087
+# Prior 1-sigma of the slope of the specimen: six degrees, so that pictures at low magnification, where it shows, decide
+# whether it lies flat; at high magnification it does not show, and does no harm.
+_SLOPE_SIGMA_RAD = 0.1
 # Least repeatability of the scale of a magnification that is set again: that of the last digit of a scan generator.
 _LEAST_VISIT = 2e-5
 
@@ -422,7 +424,7 @@ def start_state(setup: LadderSetup) -> LadderState:
 
 
 def slope_sigma() -> float:
-    """1-sigma of the slope of a specimen that is mounted flat: half a degree, as in the budget of uncertainty."""
+    """Prior 1-sigma of the slope of the specimen along each axis, rad."""
     return _SLOPE_SIGMA_RAD
 
 

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from semcal_ros.core.ladder.adjustment import adjust
 from semcal_ros.core.ladder.extend import (
     LadderPicture,
     LadderResult,
+    check_fit,
     extend_calibration,
 )
 from semcal_ros.core.ladder.residuals import Link, make_link
@@ -110,12 +112,17 @@ def test_the_file_gives_back_the_extended_calibration(extended: LadderResult) ->
 
 
 def _links_of_truth(
-    sigma_px: float, seed: int, turned: bool = True
+    sigma_px: float,
+    seed: int,
+    turned: bool = True,
+    *,
+    steps: Sequence[float] = STEPS,
+    slope: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[LadderState, list[Link]]:
-    """Correspondences without pictures: from the truth, with noise."""
+    """Correspondences without pictures: from the truth, with noise; the specimen may slope."""
     scope, rng = make_scope(), np.random.default_rng([seed, 3])
     places, poses = [], []
-    for visit, g in enumerate(STEPS):
+    for visit, g in enumerate(steps):
         for k, move in enumerate([(0.0, 0.0), (0.25, 0.1), (-0.05, 0.25), (0.0, 0.0)]):
             places.append(PicturePlace(f"{g:g}/{k}", g, visit))
             turn = 0.5 * math.pi * (-1.0) ** visit if turned and k == 3 else 0.0
@@ -130,10 +137,14 @@ def _links_of_truth(
                 continue
             xy = rng.uniform(10.0, SIZE - 11.0, (60, 2))
             here = place_in(scope, places[i].magnification, poses[i][0], poses[i][1], xy)
-            field = scope.display_m / places[j].magnification
-            c, s = math.cos(poses[j][1]), math.sin(poses[j][1])
-            flat = (here - field * np.array(poses[j][0])) @ np.array([[c, s], [-s, c]])
-            seen = cameras[j].project(np.column_stack([flat, np.zeros(len(flat))]))
+            height = here @ slope
+            both = []
+            for k in (i, j):
+                field = scope.display_m / places[k].magnification
+                c, s = math.cos(poses[k][1]), math.sin(poses[k][1])
+                flat = (here - field * np.array(poses[k][0])) @ np.array([[c, s], [-s, c]])
+                both.append(cameras[k].project(np.column_stack([flat, height])))
+            xy, seen = both
             inside = np.all((seen > 5.0) & (seen < SIZE - 6.0), axis=1)
             first = xy[inside]
             second = seen[inside] + rng.normal(0.0, sigma_px, (len(first), 2))
@@ -181,6 +192,23 @@ def test_turned_scans_tell_aspect_and_skew() -> None:
         design = state.setup.design(STEPS[-1])[1:3] @ state.setup.theta_columns
         spreads.append(np.sqrt(np.diag(design @ fit.covariance[:part, :part] @ design.T)))
     assert np.all(spreads[0] < 0.7 * spreads[1])
+
+
+@pytest.mark.long
+def test_a_tilt_is_seen_by_its_perspective_and_refused() -> None:
+    # A tenth of the field higher or lower, under a pivot at 20 mm, is some tenths of a pixel at 360x: the slope is
+    # known to 0.01.
+    steps, slope = (1500.0, 1050.0, 730.0, 510.0, 360.0), (0.2, -0.1)
+    state, links = _links_of_truth(0.05, 0, steps=steps, slope=slope)
+    fit = adjust(state.setup, state, links)
+    np.testing.assert_allclose(fit.state.slope, slope, atol=0.05)
+    with pytest.raises(CalibrationError, match="tilted by 1"):
+        check_fit(state.setup, fit, links)
+    # The same specimen flat is no reason to refuse; this ladder goes down.
+    state, links = _links_of_truth(0.05, 0, steps=steps)
+    fit = adjust(state.setup, state, links)
+    check_fit(state.setup, fit, links)
+    assert np.hypot(*fit.state.slope) < 0.03
 
 
 # -- refusals -------------------------------------------------------------------------------------
