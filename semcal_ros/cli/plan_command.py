@@ -159,9 +159,7 @@ def _echo_ladder(steps: tuple[PlannedStep, ...]) -> None:
         )
     echo_table(["magnification", "field um", "first move", "second move", "turned"], rows)
     count = sum(len(step.moves_m) + 1 for step in steps)
-    click.echo(
-        f"{counted(count, 'picture')}; set each magnification once, and do not refocus in between"
-    )
+    click.echo(f"{counted(count, 'picture')}; set each magnification once, in this order")
 
 
 def _echo_plan(plan: ViewPlan, target: float) -> None:
