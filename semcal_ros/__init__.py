@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from semcal_ros.workflows.calibrate import calibrate
     from semcal_ros.workflows.check_and_update import check, update
     from semcal_ros.workflows.describe_recording import describe_recording
+    from semcal_ros.workflows.extend import extend
     from semcal_ros.workflows.measure_cantilever import measure_cantilever
     from semcal_ros.workflows.reconstruct import reconstruct
     from semcal_ros.workflows.rectify import rectify
@@ -42,6 +43,7 @@ __all__ = [
     "calibrate",
     "check",
     "describe_recording",
+    "extend",
     "measure_cantilever",
     "reconstruct",
     "rectify",
@@ -60,6 +62,7 @@ _HOMES = {
     "calibrate": "semcal_ros.workflows.calibrate",
     "check": "semcal_ros.workflows.check_and_update",
     "describe_recording": "semcal_ros.workflows.describe_recording",
+    "extend": "semcal_ros.workflows.extend",
     "measure_cantilever": "semcal_ros.workflows.measure_cantilever",
     "reconstruct": "semcal_ros.workflows.reconstruct",
     "rectify": "semcal_ros.workflows.rectify",

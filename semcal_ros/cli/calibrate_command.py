@@ -24,8 +24,16 @@ from typing import Any
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.grid_options import grid_options
-from semcal_ros.cli.options import LENGTH_OR_ZERO, PATH, dask_option, output_option
+from semcal_ros.cli.extend_command import echo_pairs, echo_steps
+from semcal_ros.cli.grid_options import grid_options, refuse_grid_options
+from semcal_ros.cli.options import (
+    LENGTH,
+    LENGTH_OR_ZERO,
+    PATH,
+    dask_option,
+    output_option,
+    parse_ratio,
+)
 from semcal_ros.cli.output import (
     echo_notes,
     echo_rejected,
@@ -34,7 +42,7 @@ from semcal_ros.cli.output import (
     echo_verdict,
     show_progress,
 )
-from semcal_ros.cli.recording_input import check_outputs, recording_input
+from semcal_ros.cli.recording_input import PIXEL_SIZE_AT, check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.options import (
     METHODS,
@@ -44,9 +52,11 @@ from semcal_ros.core.calibration.options import (
 )
 from semcal_ros.core.calibration.paper.pda import focal_length_and_skew, prime
 from semcal_ros.core.corners import PATTERN_NAMES, describe_odds
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted, group_by_kind
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
+from semcal_ros.workflows.calibrate_specimen import calibrate_specimen
 
 __all__ = ["command"]
 
@@ -69,6 +79,81 @@ def _parse_step(
         return float(text)
     except ValueError:
         raise click.BadParameter(f"{text!r} is neither auto nor a number such as 500") from None
+
+
+def _parse_length_in_picture(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, ...] | None:
+    """Length in m, number of the picture, and the four coordinates."""
+    if text is None:
+        return None
+    length, _, rest = text.partition("@")
+    try:
+        picture, *ends = (float(part) for part in rest.split(","))
+        if len(ends) != 4 or picture != int(picture):
+            raise ValueError
+    except ValueError:
+        raise click.BadParameter(
+            f"{text!r} is not a length such as 4.2um@0,110,80,300,82"
+        ) from None
+    return (float(LENGTH.convert(length, parameter, context)), picture, *ends)
+
+
+# Options that are about a grid or one of its methods.
+_OF_GRIDS = (
+    "method",
+    "pda_order",
+    "legendre",
+    "pda_step",
+    "breakpoints",
+    "residual",
+    "tau",
+    "squares_sigma",
+    "report",
+    "paper",
+    "dask",
+)
+
+
+def _calibrate_specimen(
+    recording: RecordedFiles,
+    output: Path,
+    config: MicroscopeConfig,
+    known_length: tuple[float, ...] | None,
+    known_sigma: float,
+) -> None:
+    context = click.get_current_context()
+    refuse_grid_options("--specimen looks at a specimen")
+    for name in _OF_GRIDS:
+        if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
+            raise InvalidValueError(
+                f"--{name.replace('_', '-')} with --specimen, which looks at no grid",
+                expected="one of the two",
+                do=f"leave out --{name.replace('_', '-')}",
+            )
+    at = context.meta.get(PIXEL_SIZE_AT)
+    if (at is None) == (known_length is None):
+        raise InvalidValueError(
+            "--specimen without a known size" if at is None else "two known sizes",
+            expected="--pixel-size 23.1nm@5000, or --length 4.2um@0,110,80,300,82",
+        )
+    with show_progress() as on_progress:
+        done = calibrate_specimen(
+            recording,
+            pixel_size=at,
+            length=known_length,
+            sigma=known_sigma,
+            config=config,
+            on_progress=on_progress,
+        )
+    done.calibration.save(output)
+    echo_verdict(done.calibration)
+    echo_steps(done.calibration, done.result.steps)
+    for weakness in done.result.weaknesses:
+        click.echo(f"note: {weakness}", err=True)
+    echo_notes(done.notes)
+    echo_pairs(done.result.rejected, done.result.unused)
+    click.echo(f"calibration: {output}")
 
 
 @click.command("calibrate")
@@ -117,6 +202,26 @@ def _parse_step(
     metavar="LENGTH",
     help="1-sigma of the height of what is measured later above or below the untilted grid.",
 )
+@click.option(
+    "--specimen",
+    is_flag=True,
+    help="Without a grid: moved, turned and zoomed pictures of a flat, textured specimen, and one known size.",
+)
+@click.option(
+    "--length",
+    "known_length",
+    callback=_parse_length_in_picture,
+    metavar="LENGTH@N,X,Y,X,Y",
+    help="--specimen: a known length, such as 4.2um@0,110,80,300,82: in picture 0, from pixel 110,80 to 300,82.",
+)
+@click.option(
+    "--known-sigma",
+    callback=parse_ratio,
+    default="1%",
+    show_default=True,
+    metavar="RATIO",
+    help="--specimen: 1-sigma of the known pixel size or length.",
+)
 @click.option("--report", type=PATH, help="Also write an HTML report.")
 @click.option(
     "--paper", is_flag=True, help="With an appendix in the report that compares with the paper."
@@ -137,6 +242,9 @@ def command(
     untilted: str | tuple[str, ...],
     squares_sigma: float | None,
     height_sigma: float,
+    specimen: bool,
+    known_length: tuple[float, ...] | None,
+    known_sigma: float,
     tau: float | None,
     report: Path | None,
     paper: bool,
@@ -148,9 +256,15 @@ def command(
     Example:
       semcal calibrate recordings/grid -o cal.yaml --report report.html
       semcal calibrate recordings/grid -o cal.yaml --untilted 0,5,10 --height-sigma 20um
+      semcal calibrate recordings/gold -o cal.yaml --specimen --pixel-size 23.1nm@5000
       semcal calibrate recordings/grid -o cal.yaml --method pda --pda-step auto
     """
     check_outputs([("-o", output, ()), ("--report", report, ())])
+    if specimen:
+        _calibrate_specimen(recording, output, config, known_length, known_sigma)
+        return
+    if known_length is not None:
+        raise InvalidValueError("--length without --specimen", expected="both", do="add --specimen")
     with show_progress() as on_progress:
         done = calibrate_recording(
             recording,

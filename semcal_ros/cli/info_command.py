@@ -94,6 +94,18 @@ def _is_calibration(path: Path) -> bool:
     )
 
 
+def _anchor_row(ladder: dict[str, Any] | None, method: str) -> list[tuple[str, str]]:
+    """What of the range comes from where; no row where all of it comes from a grid."""
+    if ladder is None:
+        return []
+    low, high = ladder["anchored"]
+    if method == "specimen":
+        return [
+            ("  origin", f"a specimen, its scale from a size that was known at {low:g}x"),
+        ]
+    return [("  origin", f"{low:g}x to {high:g}x a grid, the rest a specimen")]
+
+
 def _echo_calibration(known: Mapping[str, Any]) -> None:
     def told(name: str, show: Callable[[Any], str] = str) -> str:
         value = known[name]
@@ -113,6 +125,7 @@ def _echo_calibration(known: Mapping[str, Any]) -> None:
             "range",
             f"{low:g}x to {high:g}x, {counted(len(known['magnifications']), 'magnification')}",
         ),
+        *_anchor_row(known["ladder"], known["method"]),
         ("image", f"{known['image_width_px']} x {known['image_height_px']} px"),
         ("display width", f"{known['display_width_m']:g} m"),
         ("squares", told("squares_m", lambda s: ", ".join(f"{1e6 * v:g} um" for v in s))),

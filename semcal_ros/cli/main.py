@@ -41,6 +41,7 @@ _COMMANDS = {
     "drift": "specimen drift of a recording, as a table",
     "evaluate": "reprojection error of a calibration on a recording",
     "export": "a calibration as a file of OpenCV, ROS, mrcal, COLMAP, Fiji, or a table",
+    "extend": "a calibration beyond its grid, by pictures of a specimen",
     "import": "make a bag from a folder of SEM TIFF files",
     "import-calibration": "a calibration from a table of pixel sizes",
     "info": "what a recording contains",

@@ -38,17 +38,30 @@ from semcal_ros.core.calibration.judgement.plan import (
     plan_views,
 )
 from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
+from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.ladder.plan import PlannedStep, plan_ladder
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
 
 __all__ = ["command"]
 
 
+def _parse_magnification(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | None:
+    if text is None:
+        return None
+    try:
+        return float(text.strip().removesuffix("x"))
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is not a magnification such as 100000x") from error
+
+
 @click.command("plan")
 @click.argument("calibration", type=PATH)
 @click.option(
     "--target",
-    required=True,
+    default=None,
     callback=parse_ratio,
     metavar="RATIO",
     help="1-sigma of nm per pixel to reach at all calibrated magnifications, such as 0.1%.",
@@ -71,26 +84,49 @@ __all__ = ["command"]
 @squares_option(
     "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
 )
+@click.option(
+    "--extend",
+    "last",
+    default=None,
+    callback=_parse_magnification,
+    metavar="G",
+    help="Instead: pictures of a specimen with which `semcal extend` reaches this magnification, such as 100000x.",
+)
 @config_option
 @json_option
 def command(
     calibration: Path,
-    target: float,
+    target: float | None,
     visits: int,
     ageing: float,
     squares: tuple[float, ...] | None,
+    last: float | None,
     config: str,
     as_json: bool,
 ) -> None:
-    """Which views to record next for CALIBRATION, so that nm per pixel becomes more certain.
+    """Which views to record next for CALIBRATION, so that nm per pixel becomes more certain, or reaches farther.
 
-    Record them, and use them with `semcal update`.
+    Record them, and use them with `semcal update`; those of --extend with `semcal extend`.
 
     \b
     Example:
       semcal plan cal.yaml --target 0.1%
+      semcal plan cal.yaml --extend 100000x
     """
+    if (target is None) == (last is None):
+        raise InvalidValueError(
+            "neither --target nor --extend" if target is None else "--target and --extend",
+            expected="one of the two",
+        )
     model = Calibration.load(calibration)
+    if last is not None:
+        steps = plan_ladder(model, last)
+        if as_json:
+            echo_json([asdict(step) for step in steps])
+        else:
+            _echo_ladder(steps)
+        return
+    assert target is not None
     microscope = resolve_config(config, model)
     plan = plan_views(
         model,
@@ -103,6 +139,27 @@ def command(
         echo_json(asdict(plan))
     else:
         _echo_plan(plan, target)
+
+
+def _echo_ladder(steps: tuple[PlannedStep, ...]) -> None:
+    click.echo(
+        "over one place of a flat, textured specimen, untilted; at each magnification a picture in the middle, two that"
+    )
+    click.echo("are moved by x, y um, and one in the middle with the scan turned:")
+    rows = []
+    for step in steps:
+        moves = [f"{1e6 * x:+.3g}, {1e6 * y:+.3g}" for x, y in step.moves_m[1:]]
+        rows.append(
+            [
+                f"{step.magnification:g}",
+                f"{1e6 * step.field_m:.3g}",
+                *moves,
+                f"{math.degrees(step.turn_rad):+.0f} deg",
+            ]
+        )
+    echo_table(["magnification", "field um", "first move", "second move", "turned"], rows)
+    count = sum(len(step.moves_m) + 1 for step in steps)
+    click.echo(f"{counted(count, 'picture')}; set each magnification once, in this order")
 
 
 def _echo_plan(plan: ViewPlan, target: float) -> None:

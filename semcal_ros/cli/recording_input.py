@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import click
 
@@ -32,6 +32,8 @@ from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import resolve_config
 
 __all__ = [
+    "PIXEL_SIZE_AT",
+    "PixelSizeAt",
     "check_outputs",
     "check_spared",
     "optional_recording_input",
@@ -65,12 +67,41 @@ class _Region(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # likew
         return x, y, width, height
 
 
+class PixelSizeAt(NamedTuple):
+    """A pixel size that is known at one magnification."""
+
+    size_m: float
+    magnification: float
+
+
+class _PixelSize(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # likewise
+    """A length, or one at a magnification: ``23.1nm@5000``."""
+
+    name = "length"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | PixelSizeAt:
+        text, at, magnification = str(value).partition("@")
+        size = LENGTH.convert(text, param, ctx)
+        if not at:
+            return float(size)
+        try:
+            g = float(magnification.strip().removesuffix("x"))
+        except ValueError:
+            self.fail(f"{value!r} is not a pixel size such as 23.1nm or 23.1nm@5000", param, ctx)
+        return PixelSizeAt(float(size), g)
+
+
+#: Where a command that takes a :class:`PixelSizeAt` finds it in the context of click.
+PIXEL_SIZE_AT = "semcal.pixel_size_at"
+
 # What recordings do not say about themselves, described once for all commands.
 _READING_OPTIONS = (
     config_option,
     click.option(
         "--pixel-size",
-        type=LENGTH,
+        type=_PixelSize(),
         metavar="LENGTH",
         help="Pixel size of all images, such as 43.9nm, instead of what files say.",
     ),
@@ -143,7 +174,7 @@ def _reading(command: Command, *, several: bool, required: bool = True) -> Comma
     def read(
         paths: tuple[Path, ...],
         config: str,
-        pixel_size: float | None,
+        pixel_size: float | PixelSizeAt | None,
         magnification: float | None,
         display_width: float | None,
         frame_interval: float | None,
@@ -154,6 +185,16 @@ def _reading(command: Command, *, several: bool, required: bool = True) -> Comma
         **others: Any,
     ) -> Any:
         microscope = resolve_config(config, frame_time_s=frame_time)
+        if isinstance(pixel_size, PixelSizeAt):
+            context = click.get_current_context()
+            if not context.params.get("specimen"):
+                raise InvalidValueError(
+                    "a --pixel-size at one magnification",
+                    expected="that of all images",
+                    do="leave out @ and the magnification; only calibrate --specimen takes them",
+                )
+            context.meta[PIXEL_SIZE_AT] = pixel_size
+            pixel_size = None
         stated: tuple[object, ...] = (pixel_size, magnification, display_width, frame_interval)
         stated += (frame_time, databar_rows, roi, mask)
         if not paths and any(value is not None for value in stated):

@@ -58,7 +58,8 @@ def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], C
     type=click.Choice(PLAN_KINDS),
     default="grid",
     show_default=True,
-    help="Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it.",
+    help="Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen "
+    "beyond the grid.",
 )
 @click.option(
     "--preset", "name", type=click.Choice(sorted(PRESETS)), default="jsm820", show_default=True
@@ -74,14 +75,14 @@ def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], C
     "magnifications",
     type=float,
     multiple=True,
-    help="grid, steps: repeat for each; drift: one; zoom: first and last.",
+    help="grid, steps: repeat for each; drift: one; zoom, ladder: first and last.",
 )
 @click.option(
     "--views",
     type=click.IntRange(1, MOST_VIEWS),
     default=5,
     show_default=True,
-    help="grid: poses each.",
+    help="grid, ladder: poses each.",
 )
 @click.option(
     "--frames",
@@ -178,6 +179,7 @@ def command(
     Example:
       semcal simulate grid --plan grid --preset jsm820
       semcal simulate worn --eucentric-error 300um --repeatability 0.4% --grid-stretch 0.1%
+      semcal simulate ladder --plan ladder
       semcal simulate zoom --plan zoom --magnification 600 --magnification 6000
     """
     stage = make_stage(

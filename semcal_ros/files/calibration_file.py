@@ -37,6 +37,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.fit_record import Certificate, FitRecord, ScaleShares
+from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
@@ -139,6 +140,8 @@ def format_calibration(model: CalibrationModel) -> str:
     if model.provenance != Provenance():
         known = asdict(model.provenance).items()
         data["provenance"] = {name: _to_plain(value) for name, value in known if value}
+    if model.ladder is not None:
+        data["ladder"] = _to_plain(asdict(model.ladder))
     if field is not None:
         data["residual_field"] = _write_field(field, model.covariance[size:])
     body: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
@@ -243,7 +246,16 @@ def _read_fields(data: Mapping[str, Any]) -> dict[str, Any]:
         "scale_sigma": ScaleSigma(**data.get("scale_sigma", {})),
         "record": _read_record(data),
         "provenance": _read_provenance(data.get("provenance", {})),
+        "ladder": _read_ladder(data.get("ladder")),
     }
+
+
+def _read_ladder(data: Mapping[str, Any] | None) -> LadderRecord | None:
+    if data is None:
+        return None
+    low, high = _check_finite(data["anchored"])
+    relays = tuple(Relay(**relay) for relay in data.get("relays", ()))
+    return LadderRecord((low, high), float(data["growth"]), relays)
 
 
 def _write_record(record: FitRecord) -> dict[str, Any]:
@@ -327,6 +339,7 @@ def _read_function(data: Mapping[str, Any]) -> ContinuousFunction:
         (float(low), float(high)),
         np.array(_check_finite(data.get("shape", []))),
         np.array(data.get("breaks", []), dtype=np.float64),
+        np.array(_check_finite(data.get("extension", []))),
     )
 
 
@@ -340,6 +353,8 @@ def _write_function(function: ContinuousFunction) -> dict[str, Any]:
         out["shape"] = function.shape.tolist()
     if len(function.breaks):
         out["breaks"] = function.breaks.tolist()
+    if len(function.extension):
+        out["extension"] = function.extension.tolist()
     return out
 
 

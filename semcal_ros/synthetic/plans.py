@@ -56,6 +56,7 @@ __all__ = [
     "RecordingPlan",
     "calibration_plan",
     "drift_plan",
+    "ladder_plan",
     "specimen_for",
     "steps_plan",
     "zoom_plan",
@@ -68,6 +69,9 @@ CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in ran
 """100 and 500, 1000, ... 10 000, as in Malti et al. (2012)."""
 
 
+# Ratio of neighbouring magnifications of a ladder, and the moves at each, in fields of view.
+_LADDER_STEP = 1.5
+_LADDER_MOVES = ((0.0, 0.0), (0.25, 0.08), (-0.07, 0.26), (-0.2, -0.16))
 # Tilt and rotation of what is not recorded at many poses.
 _RESTING_RAD = (math.radians(8.0), 0.1)
 
@@ -335,6 +339,50 @@ def zoom_plan(
     step_s = microscope.timing.acquisition_time_s if interval_s is None else interval_s
     plan = RecordingPlan(microscope, kind, (), drift, detector or Detector(), seed, stage, grid)
     return _at_rest(plan, sweep.tolist(), step_s, pose, _RESTING_RAD, one_region=True)
+
+
+def ladder_plan(
+    microscope: VirtualMicroscope,
+    *,
+    first_magnification: float = 4400.0,
+    last_magnification: float = 100e3,
+    views: int = 5,
+    kind: str = "gold",
+    interval_s: float = 5.0,
+    drift: DriftFunction = DRIFTS["slow"],
+    detector: Detector | None = None,
+    seed: int = 0,
+    stage: SimulatedStage | None = None,
+) -> RecordingPlan:
+    """Plan one place of a flat specimen at a ladder of magnifications, in equal steps of at most 1.5.
+
+    At each magnification there are ``views`` pictures: one in the middle, others moved by a quarter of the field, and
+    the last one with the scan turned by a quarter, to either side in turn.
+    """
+    _require_positive("views per magnification", views)
+    low, high = sorted((first_magnification, last_magnification))
+    steps = max(1, math.ceil(math.log(high / low) / math.log(_LADDER_STEP) - 1e-9))
+    ladder = (low * (high / low) ** (np.arange(steps + 1) / steps)).round(1)
+    rng, scales = np.random.default_rng((seed, 0x1ADD)), visit_scales(stage, seed)
+    planned: list[PlannedFrame] = []
+    for visit, g in enumerate(ladder.tolist()):
+        field_m, scale = microscope.nominal_pixel_size_m(g) * microscope.width, next(scales)
+        for index in range(views):
+            is_turned = views > 1 and index == views - 1
+            turn = 0.5 * math.pi * (-1.0) ** visit if is_turned else 0.0
+            move = (0.0, 0.0) if is_turned else _LADDER_MOVES[index % len(_LADDER_MOVES)]
+            place = field_m * (np.array(move) + rng.normal(0.0, 0.02, 2))
+            # The scan turns by what is set to a tenth of a degree.
+            angle = turn + math.radians(0.1) * float(rng.normal())
+            flat = Pose.flat(rotation_rad=angle)
+            pose = Pose(flat.R, -(flat.R @ np.append(place, 0.0)))
+            position = StagePosition(x_m=place[0], y_m=place[1], scan_rotation_rad=turn)
+            read = position if stage is None else read_position(stage, position, rng)
+            at_s = interval_s * len(planned)
+            planned.append(PlannedFrame(at_s, g, pose, None, visit, scale, position, read))
+    return RecordingPlan(
+        microscope, kind, tuple(planned), drift, detector or Detector(), seed, stage
+    )
 
 
 def steps_plan(

@@ -57,6 +57,7 @@ def describe_calibration(calibration: Calibration) -> dict[str, Any]:
         "method": calibration.method,
         "magnification_range": list(calibration.magnification_range),
         "magnifications": list(calibration.magnifications),
+        "ladder": None if calibration.ladder is None else asdict(calibration.ladder),
         "image_width_px": calibration.image_width,
         "image_height_px": calibration.image_height,
         "display_width_m": calibration.display_width_m,

@@ -38,6 +38,7 @@ from semcal_ros.synthetic import (
     conditions_of,
     drift_plan,
     drift_preset,
+    ladder_plan,
     preset,
     steps_plan,
     truth_of,
@@ -52,13 +53,14 @@ from semcal_ros.workflows.inputs import (
 
 __all__ = ["MOST_FRAMES", "MOST_VIEWS", "PLAN_KINDS", "plan_recording", "simulate"]
 
-#: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it.
-PLAN_KINDS = ("grid", "drift", "steps", "zoom")
+#: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen beyond the
+#: grid.
+PLAN_KINDS = ("grid", "drift", "steps", "zoom", "ladder")
 #: Poses of a grid at each magnification, and frames: ten times those of the longest recordings in use. More are a
 #: slip of the hand, and would fill the disk.
 MOST_VIEWS, MOST_FRAMES = 1000, 200_000
 # Numbers of magnifications of the plans that do not take any number of them.
-_MAGNIFICATIONS = {"drift": 1, "zoom": 2}
+_MAGNIFICATIONS = {"drift": 1, "zoom": 2, "ladder": 2}
 _STAGE = STAGES["one-axis"]
 
 
@@ -89,10 +91,10 @@ def plan_recording(
     drift
         Name of the drift of the specimen.
     magnifications
-        For ``drift`` one, for ``zoom`` the first and the last, else any number; the default is
+        For ``drift`` one, for ``zoom`` and ``ladder`` the first and the last, else any number; the default is
         that of the plan.
     views
-        Number of poses at each magnification (``grid``).
+        Number of poses at each magnification (``grid``, ``ladder``).
     frames
         Number of frames, for ``steps`` at each magnification.
     seed
@@ -153,6 +155,18 @@ def plan_recording(
             seed=seed,
             stage=stage,
             grid=grid,
+        )
+    elif kind == "ladder":
+        first, last = chosen or (4400.0, 100e3)
+        plan = ladder_plan(
+            microscope,
+            first_magnification=first,
+            last_magnification=last,
+            views=views,
+            kind=specimen or "gold",
+            detector=detector,
+            seed=seed,
+            stage=stage,
         )
     else:
         first, last = chosen or (600.0, 6000.0)

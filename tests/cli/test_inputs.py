@@ -37,6 +37,7 @@ COMMANDS: dict[str, Callable[[Path], list[object]]] = {
     "calibrate": lambda f: ["calibrate", "-o", f / "new.yaml"],
     "check": lambda f: ["check", f / "cal.yaml"],
     "update": lambda f: ["update", "-o", f / "new.yaml", f / "cal.yaml"],
+    "extend": lambda f: ["extend", "-o", f / "new.yaml", f / "cal.yaml"],
     "evaluate": lambda f: ["evaluate", f / "cal.yaml"],
     "drift": lambda f: ["drift", "-o", f / "drift.csv"],
     "rectify": lambda f: ["rectify", "--calibration", f / "cal.yaml", "-o", f / "flat.tif"],

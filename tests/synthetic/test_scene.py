@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -40,6 +41,7 @@ from semcal_ros.synthetic import (
     calibration_plan,
     drift_plan,
     drift_preset,
+    ladder_plan,
     preset,
     random_poses,
     render_frame,
@@ -214,6 +216,25 @@ def test_drift_recording_moves_as_its_truth_says() -> None:
     assert np.hypot(*expected) > 1.5
     # Phase correlation of noisy frames is good to about 0.05 px.
     assert (dx, dy) == pytest.approx(tuple(expected), abs=0.15)
+
+
+def test_ladder_plan_moves_turns_and_steps() -> None:
+    scope = preset("jsm820")
+    plan = ladder_plan(scope, first_magnification=8000.0, last_magnification=20000.0, views=4)
+    seen = sorted({frame.magnification for frame in plan.frames})
+    assert (seen[0], seen[-1], len(plan)) == (8000.0, 20000.0, 4 * len(seen))
+    assert max(b / a for a, b in pairwise(seen)) <= 1.5 + 1e-4
+    for frame in plan.frames:
+        turn = math.atan2(frame.pose.R[1, 0], frame.pose.R[0, 0])
+        assert frame.joints is not None
+        # The scan turns by what is set, to a tenth of a degree (1-sigma).
+        assert turn == pytest.approx(frame.joints["scan_rotation"], abs=math.radians(0.5))
+        # What lies at the position of the stage is seen in the middle.
+        at = np.array([[frame.joints["x"], frame.joints["y"]]])
+        np.testing.assert_allclose(frame.pose.sem_from_specimen(at)[0, :2], 0.0, atol=1e-15)
+    assert sum(
+        abs(frame.joints["scan_rotation"]) > 1.0 for frame in plan.frames if frame.joints
+    ) == len(seen)
 
 
 def test_zoom_plan_keeps_the_pose_and_one_region() -> None:

@@ -26,6 +26,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.fit_record import FitRecord
+from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
@@ -163,6 +164,8 @@ class CalibrationModel:
         old files that do not say it.
     provenance
         Where it comes from.
+    ladder
+        How it was extended beyond the grid, or None where it was not.
     """
 
     functions: Mapping[str, ContinuousFunction]
@@ -177,6 +180,7 @@ class CalibrationModel:
     scale_sigma: ScaleSigma = ScaleSigma()
     record: FitRecord | None = None
     provenance: Provenance = field(default_factory=Provenance)
+    ladder: LadderRecord | None = None
 
     def __post_init__(self) -> None:
         missing = [name for name in FUNCTION_NAMES if name not in self.functions]
@@ -227,7 +231,7 @@ class CalibrationModel:
         Outside :attr:`magnification_range` the functions continue along their tangents in log g,
         ``in_range`` is False, and the covariance grows with the distance from the range. The
         covariance is that of the next time that this magnification is set: it contains
-        :attr:`scale_sigma`.
+        :attr:`scale_sigma`, and what the :attr:`ladder` adds beyond the grid.
 
         Raises
         ------
@@ -252,6 +256,7 @@ class CalibrationModel:
         parameters = design @ theta
         with np.errstate(over="ignore"):
             covariance[0, 0] += (parameters[0] * self.scale_sigma.relative(parameters[5])) ** 2
+            covariance[0, 0] += (parameters[0] * self.ladder_sigma(g)) ** 2
         values = dict(zip(ALL_NAMES, parameters.tolist(), strict=False))
         try:
             return ScanCamera(
@@ -270,6 +275,13 @@ class CalibrationModel:
                 expected=f"a magnification near the calibrated range {low:g} to {high:g}",
                 do="calibrate there",
             ) from error
+
+    def ladder_sigma(self, magnification: float) -> float:
+        """Relative 1-sigma of the scale that a ladder adds beyond the grid; 0 without one."""
+        if self.ladder is None:
+            return 0.0
+        g = checked_magnification(magnification)
+        return float(np.hypot(self.ladder.growth_sigma(g), self.ladder.relay_sigma(g)))
 
     def extrapolation_sigma(self, magnification: float) -> float:
         """Relative 1-sigma of the scale that a magnification outside the calibrated range adds; 0 inside."""

@@ -73,6 +73,21 @@ def _chebyshev_row(value: float, size: int) -> Array:
     return np.array(row[:size])
 
 
+def _extension_row(x: float, knots: Array) -> Array:
+    """Return twofold integrals over log g of hat functions, one on each knot but the last, from the first knot on.
+
+    ``x`` and the ``knots`` are logarithms; the knots ascend, and nothing is added below the first one.
+    """
+    steps = np.diff(knots)
+    beyond = np.maximum(x - knots, 0.0)
+    cubes = beyond**3 / 6.0
+    # A ramp up, a ramp down, and none after that: the second derivative is a hat.
+    row = np.zeros(len(steps))
+    row[0] = 0.5 * beyond[0] ** 2 - (cubes[0] - cubes[1]) / steps[0]
+    row[1:] = (cubes[:-2] - cubes[1:-1]) / steps[:-1] - (cubes[1:-1] - cubes[2:]) / steps[1:]
+    return row
+
+
 def basis_row(kind: str, size: int, g: float, g_range: tuple[float, float], shape: Array) -> Array:
     """Return (size,) values of the basis functions at a magnification inside ``g_range``."""
     low, high = g_range
@@ -111,6 +126,10 @@ class ContinuousFunction:
     breaks
         Magnifications at which a polynomial jumps, because the microscope switches its scan range
         there; each belongs to the range above it. The last coefficients are the sizes of the jumps.
+    extension
+        Magnifications beyond one end of ``g_range``, from that end on outwards, between which the second derivative by
+        log g is linear: the tangent is bent there, and goes on straight after the last one. The coefficients before
+        those of the jumps are the second derivatives at all but the last. Empty where nothing is known beyond.
     """
 
     kind: str
@@ -118,6 +137,7 @@ class ContinuousFunction:
     g_range: tuple[float, float]
     shape: Array = field(default_factory=lambda: np.empty(0))
     breaks: Array = field(default_factory=lambda: np.empty(0))
+    extension: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -131,9 +151,10 @@ class ContinuousFunction:
             raise InvalidValueError(
                 f"coefficients {self.coefficients!r}", expected="a vector of finite numbers"
             )
+        self._check_extension()
         self._check_breaks()
         shaped = self.kind in ("linear_log", "ode")
-        if self.size < 1 or (shaped and len(self.shape) != self.size):
+        if self.size < 1 or (shaped and len(self.shape) != self.smooth_size):
             raise InvalidValueError(
                 f"{self.size} coefficients with a shape of {len(self.shape)}",
                 expected="at least one coefficient, and a shape of equal length where the kind has one",
@@ -143,8 +164,32 @@ class ContinuousFunction:
         ):
             raise InvalidValueError("knots out of order", expected="increasing magnifications")
 
-    def _check_breaks(self) -> None:
+    def _check_extension(self) -> None:
+        if len(self.extension) == 0:
+            return
         low, high = self.g_range
+        upwards, downwards = (
+            bool(np.isclose(self.extension[0], end, rtol=1e-9)) for end in (high, low)
+        )
+        steps = np.diff(self.extension)
+        fits = np.all(np.isfinite(self.extension)) and np.all(self.extension > 0.0)
+        fits &= len(steps) > 0 and (
+            (upwards and np.all(steps > 0)) or (downwards and np.all(steps < 0))
+        )
+        if not fits or self.smooth_size < 1:
+            raise InvalidValueError(
+                f"an extension over {self.extension.tolist()} with {self.size} coefficients",
+                expected=f"magnifications from {low:g} downwards or from {high:g} upwards, and one coefficient less",
+            )
+
+    @property
+    def full_range(self) -> tuple[float, float]:
+        """(lowest, highest) magnification with the extension."""
+        ends = [*self.g_range, *self.extension.tolist()]
+        return min(ends), max(ends)
+
+    def _check_breaks(self) -> None:
+        low, high = self.full_range
         inside = np.all((self.breaks > low) & (self.breaks <= high))
         if not (inside and np.all(np.diff(self.breaks) > 0)):
             raise InvalidValueError(
@@ -164,15 +209,16 @@ class ContinuousFunction:
 
     @property
     def smooth_size(self) -> int:
-        """Number of coefficients without the jumps."""
-        return len(self.coefficients) - len(self.breaks)
+        """Number of coefficients without the jumps and the extension."""
+        return len(self.coefficients) - len(self.breaks) - max(len(self.extension) - 1, 0)
 
     @property
     def basis_key(self) -> tuple[object, ...]:
         """What :meth:`basis` depends on besides the magnification: equal for functions that share it."""
         shape = () if len(self.shape) == 0 else tuple(self.shape.tolist())
         breaks = () if len(self.breaks) == 0 else tuple(self.breaks.tolist())
-        return self.kind, self.size, self.g_range, shape, breaks
+        beyond = () if len(self.extension) == 0 else tuple(self.extension.tolist())
+        return self.kind, self.size, self.g_range, shape, breaks, beyond
 
     def basis(self, g: float) -> Array:
         """Return the (size,) row with ``value = basis(g) @ coefficients``; tangent out of range."""
@@ -184,6 +230,11 @@ class ContinuousFunction:
             inside = edge * float(np.exp(step))
             inner = basis_row(self.kind, self.smooth_size, inside, self.g_range, self.shape)
             row = row + (inner - row) / step * np.log(g / edge)
+        if len(self.extension):
+            # Downwards, everything is mirrored.
+            sign = 1.0 if self.extension[-1] > self.extension[0] else -1.0
+            bent = _extension_row(sign * float(np.log(g)), sign * np.log(self.extension))
+            row = np.concatenate([row, bent])
         if len(self.breaks) == 0:
             return row
         return np.concatenate([row, (g >= self.breaks).astype(np.float64)])

@@ -123,14 +123,26 @@ def _scale_parts(
         )
     rectified, sigma = camera.rectified, model.scale_sigma
     own = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]
-    extra = sigma.relative(camera.rho)
+    extra = float(np.hypot(sigma.relative(camera.rho), model.ladder_sigma(magnification)))
     beyond = model.extrapolation_sigma(magnification)
+    views = max(own**2 - extra**2 - beyond**2, 0.0)
+    steps = 0.0
+    if (ladder := model.ladder) is not None and ladder.beyond(magnification) > 0.0:
+        # What is not known at the end of the grid goes with every step; the rest comes from the steps.
+        end = min(max(magnification, ladder.anchored[0]), ladder.anchored[1])
+        at_end = model.at(end)
+        known = (max(at_end.rectified.pixel_size_sigma_m) * at_end.m) ** 2
+        known -= sigma.relative(at_end.rho) ** 2
+        steps, views = max(views - known, 0.0), min(views, max(known, 0.0))
+        steps = math.hypot(math.sqrt(steps), ladder.growth_sigma(magnification))
     parts = {
         "repeatability of the magnification": sigma.repeatability,
         "squares of the grid": sigma.grid,
         "height of the specimen": camera.rho * sigma.height_m / stretch,
         "magnification outside the calibrated range": beyond,
-        **_split_views(model, magnification, max(own**2 - extra**2 - beyond**2, 0.0)),
+        "steps of the ladder beyond the grid": steps,
+        "place of a relay": 0.0 if ladder is None else ladder.relay_sigma(magnification),
+        **_split_views(model, magnification, views),
         # The cosine of a small tilt differs from 1 by half of its square, of which this is the RMS.
         "tilt of the specimen": 0.5 * math.sqrt(3.0) * _TILT_SIGMA_RAD**2,
     }

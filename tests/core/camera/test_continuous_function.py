@@ -71,6 +71,53 @@ def test_out_of_range_follows_the_tangent_in_log_g(kind, factor):
         assert function(outside) == pytest.approx(expected, abs=2e-2 * np.log(factor) + 1e-9)
 
 
+@pytest.mark.parametrize("upwards", [True, False])
+def test_extension_bends_the_tangent_by_its_second_derivatives(upwards: bool) -> None:
+    edge = RANGE[1] if upwards else RANGE[0]
+    sign = 1.0 if upwards else -1.0
+    knots = edge * np.exp(sign * np.array([0.0, 0.4, 0.9, 1.3]))
+    base = ContinuousFunction("chebyshev_log", np.array([1.0, 0.2, -0.1]), RANGE)
+    bends = np.array([0.3, -0.5, 0.2])
+    function = ContinuousFunction(
+        "chebyshev_log", np.append(base.coefficients, bends), RANGE, extension=knots
+    )
+    # Inside, and at the edge with its slope, nothing changes.
+    for g in (150.0, 3000.0, edge):
+        assert function(g) == pytest.approx(base(g), abs=1e-14)
+    near = edge * np.exp(sign * 1e-4)
+    assert function(near) == pytest.approx(base(near), abs=1e-8)
+    # Numerical second derivatives by log g are the hats' values: at the knots, between them, and beyond the last.
+    step = 1e-3
+    for at, expected in ((0.4, -0.5), (0.65, -0.15), (0.9, 0.2), (1.1, 0.1), (1.6, 0.0)):
+        left, middle, right = (
+            function(edge * np.exp(sign * x)) for x in (at - step, at, at + step)
+        )
+        # The mean of the hats over the step differs from their value at a knot by a quarter of the change of slope.
+        assert (left - 2.0 * middle + right) / step**2 == pytest.approx(expected, abs=2e-3)
+
+
+def test_breaks_may_lie_in_the_extension() -> None:
+    function = ContinuousFunction(
+        "chebyshev_log",
+        np.array([1.0, 0.5, 0.02]),
+        RANGE,
+        breaks=np.array([15000.0]),
+        extension=np.array([10000.0, 20000.0]),
+    )
+    assert function.smooth_size == 1
+    assert function.full_range == (100.0, 20000.0)
+    before = function(15000.0 * (1.0 - 1e-9))
+    assert function(15000.0) - before == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "knots", [[10000.0], [9000.0, 20000.0], [10000.0, 5000.0], [10000.0, np.inf]]
+)
+def test_an_extension_begins_at_an_end_and_goes_outwards(knots: list[float]) -> None:
+    with pytest.raises(InvalidValueError, match=r"extension|coefficient"):
+        ContinuousFunction("chebyshev_log", np.array([1.0, 0.1]), RANGE, extension=np.array(knots))
+
+
 def test_single_magnification_is_a_constant():
     function = ContinuousFunction("chebyshev_log", np.array([7.0]), (500.0, 500.0))
     assert function(100.0) == function(500.0) == function(9000.0) == 7.0

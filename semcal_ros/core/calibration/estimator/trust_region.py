@@ -87,6 +87,7 @@ def descend(
     *,
     max_iterations: int,
     tolerance: float,
+    first_damping: float = FIRST_DAMPING,
 ) -> Descent[S]:
     """Lower the cost step by step.
 
@@ -100,8 +101,10 @@ def descend(
     max_iterations, tolerance
         The descent ends at this number of steps, or when a step lowers the cost by less than this part of it and
         predicts little more.
+    first_damping
+        Of the first step; less than the default is for problems that are nearly linear from the start.
     """
-    damping, relative = FIRST_DAMPING, 0.0
+    damping, relative = first_damping, 0.0
     for iteration in range(1, max_iterations + 1):
         solve = linearise(state)
         step = solve(damping)

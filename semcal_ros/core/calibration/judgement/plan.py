@@ -162,10 +162,20 @@ def plan_views(
         raise InvalidValueError(f"squares of {list(squares_m)} m", expected="positive sizes")
     low, high = model.magnification_range
     judged = np.geomspace(low, high, _JUDGED) if high > low else np.array([low])
+    if model.ladder is not None:
+        # Beyond, the grid shows nothing.
+        low, high = model.ladder.anchored
     candidates = np.geomspace(low, high, _CANDIDATES) if high > low else np.array([low])
     root = np.concatenate([_root(model), _aged(model, ageing)], axis=1)
     rows = np.stack([pixel_size_gradient(model, float(g)) @ root for g in judged])  # (G, 2, K)
-    floor = np.array([model.scale_sigma.relative(model.at(float(g)).rho) for g in judged])
+    floor = np.array(
+        [
+            np.hypot(
+                model.scale_sigma.relative(model.at(float(g)).rho), model.ladder_sigma(float(g))
+            )
+            for g in judged
+        ]
+    )
     fixed = floor if single_setting else np.zeros_like(floor)
     designs = [_design(model, float(g)) @ root for g in candidates]
     seen = [_square_for(model.at(float(g)), squares_m) for g in candidates]

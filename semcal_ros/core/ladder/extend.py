@@ -1,0 +1,803 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Extend a calibration beyond its grid by pictures of one flat, textured specimen at a ladder of magnifications.
+
+Pictures of one magnification that are shifted tell the distortion: what is far from the middle in one is near it in the
+other. A scan that is turned by a quarter exchanges the axes, and tells aspect and skew. Pictures of neighbouring
+magnifications tell the ratio of their scales; the lowest (or highest) of them lie in the range of the grid, which gives
+the metre. Sutton et al. (2007), doi:10.1007/s11340-007-9042-z, calibrate from a speckle pattern and unknown shifts at
+one magnification; Kaynig et al. (2010), doi:10.1016/j.jsb.2010.04.012, the lenses of montages from their overlaps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise, product
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Image, check_positive
+from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
+from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
+from semcal_ros.core.ladder.adjustment import LadderFit, adjust
+from semcal_ros.core.ladder.correspondences import (
+    Correspondences,
+    PairFailure,
+    Prepared,
+    match_pictures,
+)
+from semcal_ros.core.ladder.residuals import Link, camera_of, make_link, pair_rows
+from semcal_ros.core.ladder.unknowns import (
+    POSE_SIZE,
+    LadderSetup,
+    LadderState,
+    PicturePlace,
+    make_setup,
+    prior_root,
+    start_state,
+)
+from semcal_ros.core.wording import counted
+
+__all__ = [
+    "LARGEST_STEP",
+    "LadderMeasurement",
+    "LadderPicture",
+    "LadderResult",
+    "LadderStep",
+    "RejectedPair",
+    "check_fit",
+    "describe_ladder",
+    "describe_steps",
+    "extend_calibration",
+    "make_model",
+    "measure_ladder",
+]
+
+#: Largest ratio of neighbouring magnifications of a ladder: at 1.6 the upper picture covers 39 % of the lower one.
+LARGEST_STEP = 1.6
+# What rounding of a magnification adds.
+_ROUNDING = 1.02
+# Scans of unknown rotation are tried at these.
+_QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
+# Slope of a specimen that is not flat any more: 5 degrees, ten times that of one that is mounted flat.
+_STEEPEST_RAD = 0.0873
+# Residuals of twice their sigma are a model that does not fit, or pictures that do not show one plane.
+_LARGEST_FACTOR = 9.0
+_LEAST_USED = 0.5
+# A turn by less than this is none of the scan, rad; and a shift by less than this part of the field is none.
+_TURNED_RAD, _SHIFTED = 0.5, 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class LadderPicture:
+    """A picture of the specimen.
+
+    Attributes
+    ----------
+    image
+        (h, w) grey levels, without a data bar.
+    magnification
+        Its magnification.
+    name
+        For messages.
+    scan_rotation_rad
+        By how much the scan was turned, where that is known: a positive angle turns the specimen in the picture from
+        +x to +y.
+    visit
+        Number of the stretch between which the magnification was not set; None: it changes with the magnification.
+    """
+
+    image: Image
+    magnification: float
+    name: str = ""
+    scan_rotation_rad: float | None = None
+    visit: int | None = None
+
+
+@dataclass(frozen=True)
+class RejectedPair:
+    """Two pictures that were not matched, or do not agree with the others."""
+
+    first: str
+    second: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class LadderStep:
+    """What a ladder has at one magnification.
+
+    Attributes
+    ----------
+    magnification
+        The magnification.
+    pictures, turned
+        Number of pictures that were used, and how many of them are turned against the others.
+    pairs, pairs_below
+        Number of pairs with pictures of this magnification, and with those of the next lower one.
+    rms_px
+        RMS of their residuals per axis.
+    """
+
+    magnification: float
+    pictures: int
+    turned: int
+    pairs: int
+    pairs_below: int
+    rms_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class LadderResult:
+    """An extended calibration.
+
+    Attributes
+    ----------
+    model
+        The calibration over the range of the grid and of the ladder.
+    steps
+        What was there at each magnification, ascending.
+    rejected
+        Pairs of pictures that were not used.
+    unused
+        Names of pictures that were not used.
+    tilt_rad, tilt_sigma_rad
+        Slope of the specimen, and how well it is known.
+    drift_px
+        1-sigma of the drift within a frame at the highest magnification, px.
+    variance_factor
+        Mean square of the residuals over their sigmas.
+    weaknesses
+        What the recording lacks, in sentences.
+    """
+
+    model: CalibrationModel
+    steps: tuple[LadderStep, ...]
+    rejected: tuple[RejectedPair, ...]
+    unused: tuple[str, ...]
+    tilt_rad: float
+    tilt_sigma_rad: float
+    drift_px: float
+    variance_factor: float
+    weaknesses: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    """Two pictures that show the same: by their numbers, the one with the larger pixels first."""
+
+    first: int
+    second: int
+    found: Correspondences
+
+
+def extend_calibration(
+    model: CalibrationModel,
+    pictures: Sequence[LadderPicture],
+    *,
+    timing: ScanTiming | None = None,
+    on_progress: Callable[[str, int, int | None], object] = lambda _stage, _done, _total: None,
+) -> LadderResult:
+    """Extend a calibration by a ladder of pictures.
+
+    Parameters
+    ----------
+    model
+        A calibration by the joint method.
+    pictures
+        Pictures of one place of a flat specimen, untilted: at each magnification some that are shifted by a fifth to a
+        third of the field, and one whose scan is turned; the magnifications no more than a factor of 1.6 apart, from
+        inside the calibrated range on.
+    timing
+        When the pixels of a frame are scanned; only its shape matters. None: line after line.
+    on_progress
+        Called with the stage, how much is done, and how much there is.
+
+    Raises
+    ------
+    CalibrationError
+        If the ladder has a gap, pictures do not overlap, the specimen repeats, is tilted, or the pictures do not show
+        one plane at rest.
+    InvalidValueError
+        If the pictures do not fit the calibration.
+    """
+    _check_model(model)
+    _check_ladder(model, pictures)
+    measured = measure_ladder(model, pictures, timing=timing, on_progress=on_progress)
+    setup, fit = measured.setup, measured.fit
+    extended = make_model(measured)
+    steps = describe_steps(measured)
+    tilt, tilt_sigma = _tilt(setup, fit)
+    weaknesses = _find_weaknesses(model, steps, extended)
+    notes = describe_ladder(measured) | {"warnings": list(weaknesses)}
+    extended = replace(extended, statistics={**model.statistics, "ladder": notes})
+    return LadderResult(
+        extended,
+        steps,
+        measured.rejected,
+        measured.unused,
+        tilt,
+        tilt_sigma,
+        _drift_px(fit) / measured.scale,
+        fit.variance_factor,
+        weaknesses,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LadderMeasurement:
+    """An adjusted ladder with what was measured in its pictures.
+
+    Attributes
+    ----------
+    setup, fit
+        The unknowns, and their values.
+    links
+        Correspondences of the pairs.
+    scale
+        Pixels of the calibration per pixel of the pictures.
+    rejected, unused
+        Pairs and names of pictures that were not used.
+    """
+
+    setup: LadderSetup
+    fit: LadderFit
+    links: tuple[Link, ...]
+    scale: float
+    rejected: tuple[RejectedPair, ...]
+    unused: tuple[str, ...]
+
+
+def measure_ladder(
+    model: CalibrationModel,
+    pictures: Sequence[LadderPicture],
+    *,
+    timing: ScanTiming | None = None,
+    on_progress: Callable[[str, int, int | None], object] = lambda _stage, _done, _total: None,
+) -> LadderMeasurement:
+    """Match the pictures of a ladder and adjust them; arguments and errors as of :func:`extend_calibration`."""
+    scale = _scale_of_pictures(model, pictures)
+    places = _places(pictures)
+    setup = make_setup(model, tuple(places), (model.image_width, model.image_height))
+    matches, rejected = _match_all(setup, pictures, scale, on_progress)
+    used, unused = _check_connected(pictures, matches, rejected)
+    number_of = {number: k for k, number in enumerate(used)}
+    setup = make_setup(
+        model, tuple(places[k] for k in used), (model.image_width, model.image_height)
+    )
+    matches = [match for match in matches if match.first in number_of]
+    state = _start(setup, matches, number_of, scale)
+    times = _Times(timing or ScanTiming(1.0), model.image_height, model.image_width)
+    links = [_link(setup, match, number_of, scale, times) for match in matches]
+    on_progress("adjusting", 0, None)
+    fit = adjust(setup, state, links)
+    left_out = sorted(set(range(len(links))) - set(fit.kept))
+    rejected += [
+        RejectedPair(
+            setup.pictures[links[k].first].name,
+            setup.pictures[links[k].second].name,
+            "it does not agree with the other pairs",
+        )
+        for k in left_out
+    ]
+    check_fit(setup, fit, links)
+    names = tuple(pictures[k].name or f"picture {k}" for k in unused)
+    return LadderMeasurement(setup, fit, tuple(links), scale, tuple(rejected), names)
+
+
+def describe_ladder(measured: LadderMeasurement) -> dict[str, object]:
+    """What is written about a ladder for the readers of a calibration."""
+    setup, fit = measured.setup, measured.fit
+    return {
+        "pictures": len(setup.pictures),
+        "pairs": len(fit.kept),
+        "variance_factor": fit.variance_factor,
+        "drift_px": _drift_px(fit) / measured.scale,
+        "tilt_rad": _tilt(setup, fit)[0],
+        "relays": [[relay.low, relay.high, relay.jump] for relay in _relays(setup, fit)],
+        "magnifications": sorted({picture.magnification for picture in setup.pictures}),
+    }
+
+
+def _check_model(model: CalibrationModel) -> None:
+    if model.method != "joint":
+        raise InvalidValueError(
+            f"a calibration by the method {model.method}",
+            expected="one by the joint method, whose functions have a covariance together",
+            do="calibrate with --method joint",
+        )
+
+
+def _check_ladder(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> None:
+    for picture in pictures:
+        check_positive(picture.magnification, "magnification")
+    seen = sorted({picture.magnification for picture in pictures})
+    low, high = model.magnification_range
+    if not any(low * (1 - 1e-6) <= g <= high * (1 + 1e-6) for g in seen):
+        listed = f"{seen[0]:g}x to {seen[-1]:g}x" if seen else "nothing"
+        raise CalibrationError(
+            f"a ladder of {listed} without a picture in the calibrated range",
+            expected=f"one that begins between {low:g}x and {high:g}x",
+            do="record pictures of the same place there, in steps of at most 1.6",
+        )
+    for below, above in pairwise(seen):
+        if above > LARGEST_STEP * _ROUNDING * below and (above > high or below < low):
+            raise CalibrationError(
+                f"a gap in the ladder from {below:g}x to {above:g}x, a factor of {above / below:.2f}",
+                expected=f"steps of at most {LARGEST_STEP:g}",
+                do=f"record pictures at {np.sqrt(below * above):.0f}x, too",
+            )
+
+
+def _scale_of_pictures(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> float:
+    """Pixels of the calibration per pixel of the pictures."""
+    shapes = {picture.image.shape for picture in pictures}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        raise InvalidValueError(
+            f"pictures of the shapes {sorted(map(str, shapes))}",
+            expected="grey pictures of one size",
+        )
+    height, width = next(iter(shapes))
+    ratio = model.image_width / width
+    if abs(ratio * height - model.image_height) > 0.01 * model.image_height:
+        raise InvalidValueError(
+            f"pictures of {width} x {height} px",
+            expected=f"the shape of the calibration, {model.image_width} x {model.image_height}",
+        )
+    return ratio
+
+
+def _places(pictures: Sequence[LadderPicture]) -> list[PicturePlace]:
+    places: list[PicturePlace] = []
+    visit, before = -1, None
+    for number, picture in enumerate(pictures):
+        if picture.magnification != before:
+            visit, before = visit + 1, picture.magnification
+        own = visit if picture.visit is None else picture.visit
+        places.append(PicturePlace(picture.name or f"picture {number}", picture.magnification, own))
+    return places
+
+
+@dataclass(frozen=True)
+class _Times:
+    """When a pixel of the calibration's size is scanned, from -1/2 to 1/2 of the frame."""
+
+    timing: ScanTiming
+    rows: int
+    columns: int
+
+    def of(self, xy: Array) -> Array:
+        offset = self.timing.pixel_offset_s(xy[:, 1], xy[:, 0], self.rows, self.columns)
+        # All passes show the same drift at a pixel, but for their mean time.
+        middle = self.timing.pixel_offset_s(
+            0.5 * (self.rows - 1), 0.5 * (self.columns - 1), self.rows, self.columns
+        )
+        return np.asarray((offset - middle) / self.timing.frame_time_s)
+
+
+def _calibrated_xy(xy: Array, scale: float) -> Array:
+    return scale * (xy + 0.5) - 0.5
+
+
+def _picture_xy(xy: Array, scale: float) -> Array:
+    return (xy + 0.5) / scale - 0.5
+
+
+# -- correspondences ------------------------------------------------------------------------------
+
+
+def _candidates(pictures: Sequence[LadderPicture]) -> list[tuple[int, int]]:
+    """Pairs of one magnification, and of neighbouring ones, the lower magnification first."""
+    levels: dict[float, list[int]] = {}
+    for number, picture in enumerate(pictures):
+        levels.setdefault(picture.magnification, []).append(number)
+    ascending = sorted(levels)
+    pairs = [pair for g in ascending for pair in combinations(levels[g], 2)]
+    for below, above in pairwise(ascending):
+        if above <= LARGEST_STEP * _ROUNDING * below:
+            pairs += list(product(levels[below], levels[above]))
+    return pairs
+
+
+def _match_all(
+    setup: LadderSetup,
+    pictures: Sequence[LadderPicture],
+    scale: float,
+    on_progress: Callable[[str, int, int | None], object],
+) -> tuple[list[_Match], list[RejectedPair]]:
+    """Match all pairs that may overlap."""
+    start = start_state(setup)
+    cameras = [camera_of(start, k) for k in range(len(pictures))]
+    prepared = [Prepared(np.asarray(p.image, dtype=np.float32)) for p in pictures]
+    pairs = _candidates(pictures)
+    matches: list[_Match] = []
+    rejected: list[RejectedPair] = []
+    for done, (first, second) in enumerate(pairs):
+        on_progress("matching pictures", done, len(pairs))
+        best: tuple[float, Correspondences] | None = None
+        reason = ""
+        for turn in _turns_to_try(pictures[first], pictures[second]):
+            predict = _predictor(cameras[first], cameras[second], turn, scale)
+            found = match_pictures(prepared[first], prepared[second], predict)
+            if isinstance(found, Rejection):
+                reason = (
+                    found.reason if not reason or found.status is PairFailure.PERIODIC else reason
+                )
+                continue
+            if best is None or found.correlation * np.sqrt(len(found)) > best[0]:
+                best = (found.correlation * float(np.sqrt(len(found))), found)
+            if found.correlation > 0.5:
+                break
+        if best is None:
+            names = (setup.pictures[first].name, setup.pictures[second].name)
+            rejected.append(RejectedPair(*names, reason))
+            continue
+        matches.append(_Match(first, second, best[1]))
+    on_progress("matching pictures", len(pairs), len(pairs))
+    return matches, rejected
+
+
+def _turns_to_try(first: LadderPicture, second: LadderPicture) -> tuple[float, ...]:
+    if first.scan_rotation_rad is None or second.scan_rotation_rad is None:
+        return _QUARTERS
+    return (second.scan_rotation_rad - first.scan_rotation_rad,)
+
+
+def _predictor(
+    first: ScanCamera, second: ScanCamera, turn: float, scale: float
+) -> Callable[[Array], Array]:
+    """Where the second picture would show a pixel of the first if their middles showed the same."""
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.array([[c, -s], [s, c]])
+
+    def middle(camera: ScanCamera) -> Array:
+        at = 0.5 * np.array([[camera.width - 1.0, camera.height - 1.0]])
+        return camera.sem_from_ideal(camera.undistort(at))[0, :2]
+
+    here, there = middle(first), middle(second)
+
+    def predict(xy: Array) -> Array:
+        ideal = first.undistort(_calibrated_xy(xy, scale))
+        flat = (first.sem_from_ideal(ideal)[:, :2] - here) @ rotation.T + there
+        seen = second.project(np.column_stack([flat, np.zeros(len(flat))]))
+        return _picture_xy(seen, scale)
+
+    return predict
+
+
+def _check_connected(
+    pictures: Sequence[LadderPicture],
+    matches: Sequence[_Match],
+    rejected: Sequence[RejectedPair],
+) -> tuple[list[int], list[int]]:
+    """Numbers of the pictures that hang together, and of the others.
+
+    Raises
+    ------
+    CalibrationError
+        If they do not reach from one end of the ladder to the other.
+    """
+    near: dict[int, set[int]] = {k: set() for k in range(len(pictures))}
+    for match in matches:
+        near[match.first].add(match.second)
+        near[match.second].add(match.first)
+    groups: list[set[int]] = []
+    left = set(near)
+    while left:
+        group, queue = set(), deque([min(left)])
+        while queue:
+            number = queue.popleft()
+            if number not in group:
+                group.add(number)
+                queue.extend(near[number] - group)
+        groups.append(group)
+        left -= group
+    largest = max(groups, key=len)
+    levels = sorted({picture.magnification for picture in pictures})
+    missing = [g for g in levels if not any(pictures[k].magnification == g for k in largest)]
+    if missing or len(largest) < 2:
+        reasons = [pair.reason for pair in rejected]
+        most = max(set(reasons), key=reasons.count) if reasons else "too few pictures"
+        present = [g for g in levels if g not in missing]
+        where = f"{missing[0]:g}x" if missing else f"{levels[0]:g}x"
+        nearest = (
+            min(present, key=lambda g: abs(np.log(g / missing[0]))) if missing and present else 0.0
+        )
+        rest = f" and those at {nearest:g}x" if nearest and len(largest) > 1 else ""
+        if any("repeats" in reason for reason in reasons):
+            most = "a specimen that repeats"
+        raise CalibrationError(
+            f"pictures at {where}{rest} that were not matched: {most}",
+            expected="pictures of one place with texture that does not repeat, which overlap by a fifth at least",
+            do="keep the place in the middle from step to step, and move by a fifth to a third of the field",
+        )
+    return sorted(largest), sorted(set(near) - largest)
+
+
+def _link(
+    setup: LadderSetup,
+    match: _Match,
+    number_of: Mapping[int, int],
+    scale: float,
+    times: _Times,
+) -> Link:
+    first_xy, second_xy = (
+        _calibrated_xy(xy, scale) for xy in (match.found.first_xy, match.found.second_xy)
+    )
+    return make_link(
+        setup,
+        (number_of[match.first], number_of[match.second]),
+        first_xy,
+        second_xy,
+        scale**2 * match.found.covariance,
+        [times.of(first_xy), times.of(second_xy)],
+    )
+
+
+def _start(
+    setup: LadderSetup,
+    matches: Sequence[_Match],
+    number_of: Mapping[int, int],
+    scale: float,
+) -> LadderState:
+    """Poses along the matches, from the first picture on."""
+    state = start_state(setup)
+    cameras = [camera_of(state, k) for k in range(len(setup.pictures))]
+    near: dict[int, list[tuple[int, Array, Array]]] = {k: [] for k in range(len(setup.pictures))}
+    for match in matches:
+        a, b = number_of[match.first], number_of[match.second]
+        flat_a, flat_b = (
+            cameras[k].sem_from_ideal(cameras[k].undistort(_calibrated_xy(xy, scale)))[:, :2]
+            for k, xy in ((a, match.found.first_xy), (b, match.found.second_xy))
+        )
+        near[a].append((b, flat_a, flat_b))
+        near[b].append((a, flat_b, flat_a))
+    values = state.values.copy()
+    poses = {0: (0.0, np.zeros(2))}
+    queue = deque([0])
+    while queue:
+        number = queue.popleft()
+        angle, shift = poses[number]
+        for other, own_flat, other_flat in near[number]:
+            if other in poses:
+                continue
+            c, s = np.cos(angle), np.sin(angle)
+            on_specimen = (own_flat - shift) @ np.array([[c, -s], [s, c]])
+            poses[other] = _rigid(on_specimen, other_flat)
+            queue.append(other)
+    start = setup.bounds[5].start
+    for number, (angle, shift) in poses.items():
+        at = start + POSE_SIZE * number
+        values[at] = angle
+        values[at + 1 : at + 3] = shift / setup.pixel_m(setup.pictures[number].magnification)
+    return LadderState(setup, values)
+
+
+def _rigid(source: Array, target: Array) -> tuple[float, Array]:
+    """Turn and shift with ``target = R source + shift`` by least squares (Umeyama 1991, doi:10.1109/34.88573)."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    cross = a.T @ b
+    angle = float(np.arctan2(cross[0, 1] - cross[1, 0], cross[0, 0] + cross[1, 1]))
+    c, s = np.cos(angle), np.sin(angle)
+    return angle, target.mean(axis=0) - np.array([[c, -s], [s, c]]) @ source.mean(axis=0)
+
+
+# -- what came out --------------------------------------------------------------------------------
+
+
+def _drift_px(fit: LadderFit) -> float:
+    return float(np.hypot(fit.drift.steady_px, fit.drift.change_px))
+
+
+def _tilt(setup: LadderSetup, fit: LadderFit) -> tuple[float, float]:
+    slopes = setup.bounds[4]
+    values = fit.state.values[slopes]
+    spread = np.sqrt(np.trace(fit.covariance[slopes, slopes]))
+    return float(np.hypot(*values)), float(spread)
+
+
+def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None:
+    """Refuse a ladder whose specimen is tilted, or whose pictures do not show one plane at rest.
+
+    Raises
+    ------
+    CalibrationError
+        With what was seen.
+    """
+    tilt, sigma = _tilt(setup, fit)
+    if tilt > _STEEPEST_RAD and tilt > 3.0 * sigma:
+        raise CalibrationError(
+            f"a specimen that is tilted by {np.degrees(tilt):.1f} degrees",
+            expected=f"one that lies flat, to {np.degrees(_STEEPEST_RAD):.0f} degrees",
+            do="untilt the stage, and record the ladder again",
+        )
+    share = len(fit.kept) / len(links)
+    if share < _LEAST_USED or fit.variance_factor > _LARGEST_FACTOR:
+        raise CalibrationError(
+            f"pairs of pictures that disagree by {np.sqrt(fit.variance_factor):.1f} times what they state, "
+            f"{100.0 * (1.0 - share):.0f} % of them left out",
+            expected="pictures of one plane at rest",
+            do="use a flat specimen that neither charges nor moves, and wait until the drift has settled",
+        )
+    linked = {number for k in fit.kept for number in (links[k].first, links[k].second)}
+    alone = [setup.pictures[k].name for k in range(len(setup.pictures)) if k not in linked]
+    if alone:
+        raise CalibrationError(
+            f"{counted(len(alone), 'picture')} that agree with no other: {', '.join(alone[:3])}",
+            expected="pictures of one plane at rest",
+            do="leave them out",
+        )
+
+
+def _estimate_growth(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> float:
+    """Relative 1-sigma of the scale per factor of e that the pairs across the zoom do not agree on.
+
+    The ratio of two scales that one pair asks for differs from that of another pair by more than their noise where the
+    camera is not all that its model says. What is left of their mean may be the same at every step.
+    """
+    by_step: dict[tuple[float, float], list[tuple[float, float]]] = {}
+    for k in fit.kept:
+        link = links[k]
+        ends = [setup.pictures[number].magnification for number in (link.first, link.second)]
+        if ends[0] == ends[1]:
+            continue
+        rows = pair_rows(fit.state, link)
+        offset = link.second_xy - link.second_xy.mean(axis=0)
+        pattern = np.einsum("nij,nj->ni", link.weight, offset).ravel()
+        information = float(pattern @ pattern)
+        ratio = float(pattern @ rows.values) / information
+        by_step.setdefault((ends[0], ends[1]), []).append((ratio, 1.0 / information))
+    steps = [np.array(values) for values in by_step.values() if len(values) > 2]
+    if not steps:
+        return 0.0
+    excess, counts = [], []
+    for values in steps:
+        count = len(values)
+        scatter = float(np.var(values[:, 0], ddof=1))
+        noise = max(fit.variance_factor, 1.0) * float(np.mean(values[:, 1]))
+        excess.append(scatter - noise)
+        counts.append(count)
+    common = max(float(np.mean(excess)), 0.0) / float(np.mean(counts))
+    length = float(np.mean([np.log(max(pair) / min(pair)) for pair in by_step]))
+    return float(np.sqrt(common)) / length
+
+
+def _relays(setup: LadderSetup, fit: LadderFit) -> tuple[Relay, ...]:
+    values = fit.state.values[setup.bounds[2]]
+    mean = fit.state.theta[: setup.functions["scale"].size]
+    level = float(setup.functions["scale"].basis(setup.pictures[-1].magnification) @ mean)
+    return tuple(Relay(*setup.intervals[k], float(values[k]) / level) for k in sorted(fit.jumps))
+
+
+def make_model(measured: LadderMeasurement) -> CalibrationModel:
+    """The calibration that a ladder was measured with, extended by it."""
+    setup, fit, model = measured.setup, measured.fit, measured.setup.model
+    growth = _estimate_growth(setup, fit, measured.links)
+    functions_part = setup.bounds[2].stop
+    columns = setup.theta_columns
+    theta = fit.state.theta
+    own = fit.covariance[:functions_part, :functions_part]
+    covariance = columns @ own @ columns.T
+    # Jumps that were not found leave the functions.
+    dropped = [
+        int(column) for k, column in enumerate(setup.jump_columns) if k not in set(fit.jumps)
+    ]
+    kept = np.setdiff1d(np.arange(len(theta)), dropped)
+    functions, start = {}, 0
+    for name in names_of(setup.functions):
+        function = setup.functions[name]
+        inside = [k for k in range(start, start + function.size) if k not in dropped]
+        breaks = function.breaks
+        if name == "scale" and len(breaks):
+            first = start + function.size - len(breaks)
+            breaks = breaks[[k for k in range(len(breaks)) if first + k not in dropped]]
+        functions[name] = replace(function, coefficients=theta[inside], breaks=breaks)
+        start += function.size
+    whole = covariance[np.ix_(kept, kept)]
+    if model.residual is not None:
+        whole = _with_field(setup, fit, columns[kept], whole)
+    anchored = model.magnification_range if model.ladder is None else model.ladder.anchored
+    relays = () if model.ladder is None else model.ladder.relays
+    before = 0.0 if model.ladder is None else model.ladder.growth
+    ladder = LadderRecord(anchored, max(growth, before), (*relays, *_relays(setup, fit)))
+    seen = {picture.magnification for picture in setup.pictures}
+    low, high = model.magnification_range
+    outside = {g for g in seen if not low * (1 - 1e-6) <= g <= high * (1 + 1e-6)}
+    return replace(
+        model,
+        functions=functions,
+        covariance=0.5 * (whole + whole.T),
+        magnifications=tuple(sorted({*model.magnifications, *outside})),
+        ladder=ladder,
+    )
+
+
+def _with_field(setup: LadderSetup, fit: LadderFit, columns: Array, functions: Array) -> Array:
+    """The covariance with the residual field, which stays as it is, and what its correlation becomes."""
+    model = setup.model
+    size = sum(function.size for function in model.functions.values())
+    field = model.covariance[size:, size:]
+    cross = (
+        np.linalg.pinv(prior_root(model.covariance[:size, :size])) @ model.covariance[:size, size:]
+    )
+    gain = fit.covariance[: setup.bounds[2].stop, setup.bounds[0]]
+    new_cross = columns @ gain @ cross
+    return np.block([[functions, new_cross], [new_cross.T, field]])
+
+
+def describe_steps(measured: LadderMeasurement) -> tuple[LadderStep, ...]:
+    """What a ladder has at each of its magnifications, ascending."""
+    setup, fit, links, scale = measured.setup, measured.fit, measured.links, measured.scale
+    levels = sorted({picture.magnification for picture in setup.pictures})
+    squares: dict[float, list[Array]] = {g: [] for g in levels}
+    own, below = dict.fromkeys(levels, 0), dict.fromkeys(levels, 0)
+    for k in fit.kept:
+        link = links[k]
+        ends = [setup.pictures[number].magnification for number in (link.first, link.second)]
+        rows = pair_rows(fit.state, link)
+        residual = np.linalg.solve(link.weight, rows.values.reshape(-1, 2)[..., None])[..., 0]
+        squares[max(ends)].append(np.asarray(residual / scale))
+        if ends[0] == ends[1]:
+            own[ends[0]] += 1
+        else:
+            below[max(ends)] += 1
+    steps = []
+    for g in levels:
+        numbers = [k for k, picture in enumerate(setup.pictures) if picture.magnification == g]
+        angles = np.array([fit.state.poses[k, 0] for k in numbers])
+        turned = np.abs(np.angle(np.exp(1j * (angles - angles[0])))) > _TURNED_RAD
+        rms = np.sqrt(np.mean(np.concatenate(squares[g]) ** 2)) if squares[g] else 0.0
+        steps.append(
+            LadderStep(g, len(numbers), int(np.count_nonzero(turned)), own[g], below[g], float(rms))
+        )
+    return tuple(steps)
+
+
+def _find_weaknesses(
+    model: CalibrationModel, steps: Sequence[LadderStep], extended: CalibrationModel
+) -> tuple[str, ...]:
+    """What the recording lacks."""
+    low, high = model.magnification_range
+    beyond = [step for step in steps if not low <= step.magnification <= high]
+    found = []
+    if not any(step.turned for step in beyond):
+        found.append(
+            "no scan is turned beyond the grid, so that aspect and skew there rest on how they are at its end: "
+            "turn the scan by 90 degrees for a picture at every second magnification"
+        )
+    single = [step.magnification for step in beyond if step.pictures < 2]
+    if single:
+        listed = ", ".join(f"{g:g}x" for g in single[:4])
+        found.append(
+            f"one picture only at {listed}: nothing tells the distortion there; move by a fifth to a third of the field"
+        )
+    anchors = sum(1 for step in steps if low <= step.magnification <= high)
+    if anchors == 1 and model.scale_sigma.repeatability > 0.0:
+        found.append(
+            "one magnification only lies in the calibrated range, so that its scale of this visit is that of the "
+            "whole ladder: begin two or three steps lower"
+        )
+    if extended.ladder is not None and extended.ladder.relays:
+        found += [
+            f"the scale jumps by {100.0 * relay.jump:+.2f} % between {relay.low:g}x and {relay.high:g}x: "
+            "record more magnifications there to find where"
+            for relay in extended.ladder.relays
+        ]
+    return tuple(found)
