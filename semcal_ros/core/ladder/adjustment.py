@@ -53,6 +53,9 @@ _ITERATIONS, _TOLERANCE = 30, 1e-9
 # that has settled does, and more than a thirtieth of the picture is no drift.
 _FIRST_DRIFT_PX, _LEAST_DRIFT_PX, _MOST_DRIFT = 0.5, 0.02, 0.03
 _SPREADS, _SPREAD_ROUNDS = 12, 3
+# A spread that a settled specimen may have, px, and by how much a larger one must lower the variance of the residuals
+# to be believed: what else is not in the model lowers it by a few per cent.
+_SETTLED_DRIFT_PX, _UNEXPLAINED = 1.0, 1.1
 # Scans whose angle differs by less are not turned, rad.
 _TURNED_RAD = 0.5
 # Vibration stretches a frame by this at any magnification, px.
@@ -195,17 +198,37 @@ def adjust(
 ) -> LadderFit:
     """Adjust a ladder from a start.
 
+    A drift of more than a pixel within a frame is believed where it explains what a smaller one does not: otherwise it
+    would also be an aspect or a skew, and whatever else is not in the model would be taken for it.
+
     Raises
     ------
     CalibrationError
         If the adjustment does not converge.
     """
+    fit = _adjust(setup, state, links, on_progress, _MOST_DRIFT * setup.image_size[1])
+    if max(fit.drift.steady_px, fit.drift.change_px) <= _SETTLED_DRIFT_PX:
+        return fit
+    settled = _adjust(setup, state, links, on_progress, _SETTLED_DRIFT_PX)
+    is_as_good = settled.variance_factor <= _UNEXPLAINED * fit.variance_factor
+    return settled if is_as_good and len(settled.kept) >= len(fit.kept) else fit
+
+
+def _adjust(
+    setup: LadderSetup,
+    state: LadderState,
+    links: Sequence[Link],
+    on_progress: Callable[[int], object],
+    most_drift_px: float,
+) -> LadderFit:
+    """Adjust with a spread of the drift of at most so many px."""
     jumps: tuple[int, ...] = ()
     kept = tuple(range(len(links)))
-    drift = DriftSpread(_FIRST_DRIFT_PX, _FIRST_DRIFT_PX)
+    first = min(_FIRST_DRIFT_PX, most_drift_px)
+    drift = DriftSpread(first, first)
     while True:
         used = share_noise(setup, [links[k] for k in kept])
-        state, drift, descent = _settle(setup, state, used, drift, jumps)
+        state, drift, descent = _settle(setup, state, used, drift, jumps, most_drift_px)
         on_progress(len(jumps) + 1)
         matrix, right, squares = add_up(state, used)
         found = (
@@ -246,20 +269,26 @@ def _settle(
     links: Sequence[Link],
     drift: DriftSpread,
     jumps: tuple[int, ...],
+    most_drift_px: float,
 ) -> tuple[LadderState, DriftSpread, Descent[LadderState]]:
     """Adjust, with the spread of the drift within the frames."""
     for _ in range(_SPREAD_ROUNDS):
         descent = _descend(setup, state, links, drift, jumps)
         state, before = descent.state, drift
         matrix, right, _ = add_up(state, links)
-        drift = _most_likely_drift(setup, state, matrix, right, jumps)
+        drift = _most_likely_drift(setup, state, matrix, right, jumps, most_drift_px)
         if drift == before:
             break
     return state, drift, descent
 
 
 def _most_likely_drift(
-    setup: LadderSetup, state: LadderState, matrix: Array, right: Array, jumps: tuple[int, ...]
+    setup: LadderSetup,
+    state: LadderState,
+    matrix: Array,
+    right: Array,
+    jumps: tuple[int, ...],
+    most_drift_px: float,
 ) -> DriftSpread:
     """The spread of the drift that makes the correspondences most likely, whatever the unknowns are.
 
@@ -268,8 +297,7 @@ def _most_likely_drift(
     spread moves the unknowns by little, so that the equations of the pictures stay as they are. All spreads are tried,
     since there may be more than one minimum.
     """
-    most = _MOST_DRIFT * setup.image_size[1]
-    spreads = np.geomspace(_LEAST_DRIFT_PX, most, _SPREADS).tolist()
+    spreads = np.geomspace(_LEAST_DRIFT_PX, most_drift_px, _SPREADS).tolist()
     # Without a turned scan a steady drift is a stretch of the camera, and its spread is that of the changes.
     steady = spreads if _has_turns(setup, state) else [None]
     best, least = DriftSpread(spreads[0], spreads[0]), np.inf
