@@ -25,7 +25,9 @@ from matplotlib.figure import Figure
 
 from semcal_ros import Calibration, SemcalError
 from semcal_ros.core.calibration.pipeline import calibrate_views
+from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.report.calibration.curves import parts_by_specimen
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 from tests.helpers.node_scenes import make_calibration, texture
@@ -146,6 +148,18 @@ def test_the_figure_shows_scale_and_parameters(calibration):
     sigma = np.sqrt(calibration.at(500.0).covariance[0, 0])
     nominal = calibration.nominal_px_per_m(500.0)
     assert low <= line[0] - 100.0 * sigma / nominal + 1e-9
+
+
+def test_the_figure_shades_what_a_specimen_tells(calibration):
+    ladder = LadderRecord((500.0, 2000.0), 1e-4)
+    figure = Calibration.from_model(replace(calibration, ladder=ladder)).plot()
+    for axes in figure.axes:
+        (text,) = [text for text in axes.texts if text.get_text() == "specimen"]
+        assert 2000.0 < text.get_position()[0] < 4000.0
+    alone = replace(calibration, ladder=LadderRecord((2000.0, 2000.0), 1e-4), method="specimen")
+    assert parts_by_specimen(alone) == [(500.0, 4000.0)]
+    assert parts_by_specimen(calibration) == []
+    assert not any(axes.texts for axes in calibration.plot().axes)
 
 
 def test_a_single_magnification_can_be_drawn(tmp_path):

@@ -121,6 +121,7 @@ def _calibrate_specimen(
     config: MicroscopeConfig,
     known_length: tuple[float, ...] | None,
     known_sigma: float,
+    stage_scale: float | None,
 ) -> None:
     context = click.get_current_context()
     refuse_grid_options("--specimen looks at a specimen")
@@ -132,10 +133,11 @@ def _calibrate_specimen(
                 do=f"leave out --{name.replace('_', '-')}",
             )
     at = context.meta.get(PIXEL_SIZE_AT)
-    if (at is None) == (known_length is None):
+    missing = [at, known_length, stage_scale].count(None)
+    if missing != 2:
         raise InvalidValueError(
-            "--specimen without a known size" if at is None else "two known sizes",
-            expected="--pixel-size 23.1nm@5000, or --length 4.2um@0,110,80,300,82",
+            "--specimen without a known size" if missing == 3 else "two known sizes",
+            expected="--pixel-size 23.1nm@5000, --length 4.2um@0,110,80,300,82, or --stage-scale 0.5%",
         )
     with show_progress() as on_progress:
         done = calibrate_specimen(
@@ -143,6 +145,7 @@ def _calibrate_specimen(
             pixel_size=at,
             length=known_length,
             sigma=known_sigma,
+            stage_scale=stage_scale,
             config=config,
             on_progress=on_progress,
         )
@@ -222,6 +225,12 @@ def _calibrate_specimen(
     metavar="RATIO",
     help="--specimen: 1-sigma of the known pixel size or length.",
 )
+@click.option(
+    "--stage-scale",
+    callback=parse_ratio,
+    metavar="RATIO",
+    help="--specimen: the moves of the stage are the known lengths, with this 1-sigma, such as 0.5%.",
+)
 @click.option("--report", type=PATH, help="Also write an HTML report.")
 @click.option(
     "--paper", is_flag=True, help="With an appendix in the report that compares with the paper."
@@ -245,6 +254,7 @@ def command(
     specimen: bool,
     known_length: tuple[float, ...] | None,
     known_sigma: float,
+    stage_scale: float | None,
     tau: float | None,
     report: Path | None,
     paper: bool,
@@ -257,14 +267,18 @@ def command(
       semcal calibrate recordings/grid -o cal.yaml --report report.html
       semcal calibrate recordings/grid -o cal.yaml --untilted 0,5,10 --height-sigma 20um
       semcal calibrate recordings/gold -o cal.yaml --specimen --pixel-size 23.1nm@5000
+      semcal calibrate recordings/gold -o cal.yaml --specimen --stage-scale 0.5%
       semcal calibrate recordings/grid -o cal.yaml --method pda --pda-step auto
     """
     check_outputs([("-o", output, ()), ("--report", report, ())])
     if specimen:
-        _calibrate_specimen(recording, output, config, known_length, known_sigma)
+        _calibrate_specimen(recording, output, config, known_length, known_sigma, stage_scale)
         return
-    if known_length is not None:
-        raise InvalidValueError("--length without --specimen", expected="both", do="add --specimen")
+    for name, value in (("--length", known_length), ("--stage-scale", stage_scale)):
+        if value is not None:
+            raise InvalidValueError(
+                f"{name} without --specimen", expected="both", do="add --specimen"
+            )
     with show_progress() as on_progress:
         done = calibrate_recording(
             recording,

@@ -60,7 +60,7 @@ from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedFrame, View
 from semcal_ros.viewer.coverage import describe_acquisition, describe_coverage, describe_run
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.server import PageServer
-from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Magnification, Status, View
+from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Status, View
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 
 __all__ = ["Viewer", "give_way", "run_viewer"]
@@ -458,20 +458,13 @@ class Viewer(SemNode):
         return Status(
             title=f"{self.config.name}, {self.get_namespace()}",
             kind="live",
-            magnification=self._describe_magnification(
-                None if current is None else current.magnification_range
-            ),
+            magnification=describe_magnification(self._magnification, current),
             rates=describe_rates(reports),
             notes=explain(reports),
             drift=self._describe_drift(),
             actions=tuple(self._offered),
             calibration=self._describe_calibration(),
         )
-
-    def _describe_magnification(
-        self, calibrated_range: tuple[float, float] | None
-    ) -> Magnification:
-        return describe_magnification(self._magnification, calibrated_range)
 
     def _describe_drift(self) -> DriftPanel:
         return self._trace.panel("no drift is published; start stream_corrector")

@@ -161,8 +161,6 @@ class RecordingSource:
 
     def describe(self) -> Status:
         """Return where the recording stands."""
-        calibration = self._calibration
-        covered = None if calibration is None else calibration.magnification_range
         stamps, view = self._stamps, self._view
         shown_ns = self._first_ns if view is None else view.stamp_ns
         duration_s = (max([shown_ns, *stamps[-1:]]) - self._first_ns) * 1e-9
@@ -176,7 +174,7 @@ class RecordingSource:
         return Status(
             title=self.name,
             kind="recording",
-            magnification=describe_magnification(self._magnification, covered),
+            magnification=describe_magnification(self._magnification, self._calibration),
             rates=self._describe_rate(),
             notes=self._describe_notes(),
             drift=self._describe_drift(),

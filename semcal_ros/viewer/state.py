@@ -22,6 +22,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import ArrayLike
 
+from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.viewer.lengths import format_with_sigma
 from semcal_ros.viewer.source import DriftPanel, Magnification
@@ -35,7 +36,7 @@ _KEPT = 20_000
 
 
 def describe_magnification(
-    magnification: float | None, calibrated_range: tuple[float, float] | None
+    magnification: float | None, calibration: CalibrationModel | None
 ) -> Magnification:
     """Describe a magnification, and whether a calibration covers it.
 
@@ -43,19 +44,30 @@ def describe_magnification(
     ----------
     magnification
         None while it is not known.
-    calibrated_range
-        The least and greatest magnification of the calibration; None without one.
+    calibration
+        The calibration, or None. One that a specimen extended beyond its grid says where the grid ends.
     """
     if magnification is None:
         return Magnification("unknown", "unknown", "no magnification is published")
     text = f"{magnification:.6g}×"
-    if calibrated_range is None:
+    if calibration is None:
         return Magnification(text, "unknown", "not calibrated")
-    low, high = calibrated_range
-    told = f"{_round(low)}× to {_round(high)}×"
-    if low * (1 - 1e-9) <= magnification <= high * (1 + 1e-9):
+    told = _span(calibration.magnification_range)
+    origin = calibration.origin_of(magnification)
+    if origin == "extrapolated":
+        return Magnification(text, "outside", f"outside the calibration, {told}")
+    if calibration.ladder is None:
         return Magnification(text, "ok", f"calibrated, {told}")
-    return Magnification(text, "outside", f"outside the calibration, {told}")
+    if calibration.method == "specimen":
+        return Magnification(text, "ok", f"calibrated by a specimen, {told}")
+    grid = _span(calibration.ladder.anchored)
+    if origin == "grid":
+        return Magnification(text, "ok", f"calibrated by a grid, {grid}; by a specimen, {told}")
+    return Magnification(text, "ok", f"calibrated by a specimen, {told}; by a grid, {grid}")
+
+
+def _span(ends: tuple[float, float]) -> str:
+    return f"{_round(ends[0])}× to {_round(ends[1])}×"
 
 
 def _round(magnification: float) -> str:

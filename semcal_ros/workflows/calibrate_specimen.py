@@ -16,8 +16,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.errors import InvalidValueError
@@ -25,8 +27,10 @@ from semcal_ros.core.ladder.from_specimen import (
     KnownLength,
     ScaleAnchor,
     SpecimenCalibration,
+    StageMoves,
     calibrate_from_specimen,
 )
+from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.extend import read_ladder
 from semcal_ros.workflows.inputs import (
     ConfigSource,
@@ -41,6 +45,8 @@ __all__ = ["KNOWN_SIGMA", "RecordedSpecimenCalibration", "calibrate_specimen"]
 
 #: Relative 1-sigma of a size that is stated without one: what a microscope that was serviced shows.
 KNOWN_SIGMA = 0.01
+# A move on a stage that is tilted by as much looks 0.1 % shorter.
+_FLAT_RAD = 0.045
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,7 @@ def calibrate_specimen(
     pixel_size: tuple[float, float] | None = None,
     length: Sequence[float] | None = None,
     sigma: float = KNOWN_SIGMA,
+    stage_scale: float | None = None,
     config: ConfigSource | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> RecordedSpecimenCalibration:
@@ -83,6 +90,8 @@ def calibrate_specimen(
         Or a known length, m, the number of a picture, and x, y, x, y of its ends there, px.
     sigma
         Relative 1-sigma of the known size.
+    stage_scale
+        Or the relative 1-sigma of the moves of the stage, where its x and y are those of the recording or of the files.
     config
         A ``msg_configs`` name or file; the default is ``generic``.
     on_progress
@@ -102,20 +111,27 @@ def calibrate_specimen(
         done.calibration.save("jsm820.yaml")
     """
     microscope = resolve_config(config)
-    known: ScaleAnchor | KnownLength
-    if pixel_size is not None and length is None:
-        known = ScaleAnchor(*pixel_size, sigma)
-    elif length is not None and pixel_size is None and len(length) == 6:
-        length_m, picture, *ends = length
-        known = KnownLength(length_m, int(picture), (ends[0], ends[1]), (ends[2], ends[3]), sigma)
-    else:
+    if [pixel_size, length, stage_scale].count(None) != 2:
         raise InvalidValueError(
             "not one known size",
-            expected="a pixel size and its magnification, or a length, a picture and two pixels",
+            expected="a pixel size and its magnification, a length and its place, or the scale of the stage",
         )
+    known: ScaleAnchor | KnownLength | StageMoves | None = None
+    if pixel_size is not None:
+        known = ScaleAnchor(*pixel_size, sigma)
+    elif length is not None:
+        if len(length) != 6:
+            raise InvalidValueError(
+                f"a length of {len(length)} numbers", expected="a length, a picture and two pixels"
+            )
+        length_m, picture, *ends = length
+        known = KnownLength(length_m, int(picture), (ends[0], ends[1]), (ends[2], ends[3]), sigma)
     seen = read_ladder(source, microscope, None, on_progress)
     if not seen.pictures:
         raise InvalidValueError("a recording without pictures", expected="pictures of a specimen")
+    if known is None:
+        assert stage_scale is not None
+        known = _stage_moves(seen.frames.values(), stage_scale)
     result = calibrate_from_specimen(
         seen.pictures,
         known,
@@ -126,3 +142,15 @@ def calibrate_specimen(
     provenance = describe_provenance(source, microscope, seen.frames)
     calibration = Calibration.from_model(replace(result.model, provenance=provenance))
     return RecordedSpecimenCalibration(calibration, result, seen.notes)
+
+
+def _stage_moves(frames: Iterable[RecordedFrame], sigma: float) -> StageMoves:
+    """Where the stage was at each frame; not finite where it does not say so, or is tilted."""
+    position, time = [], []
+    for frame in frames:
+        stage = frame.stage
+        known = stage is not None and abs(stage.tilt_rad or 0.0) < _FLAT_RAD
+        place = (stage.x_m, stage.y_m) if stage is not None and known else (None, None)
+        position.append([np.nan if x is None else x for x in place])
+        time.append(1e-9 * frame.stamp_ns)
+    return StageMoves(np.array(position).reshape(-1, 2), np.array(time), sigma)

@@ -23,8 +23,11 @@ import numpy as np
 import pytest
 
 from semcal_ros import Calibration, extend
+from semcal_ros.config.config import load_config
+from semcal_ros.core.errors import CalibrationError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import preset
+from semcal_ros.workflows.calibrate_specimen import calibrate_specimen
 from tests.helpers.calibrations import calibrated
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run
@@ -73,8 +76,6 @@ def test_extend_writes_a_calibration_that_reaches_farther(
 
 @pytest.mark.long
 def test_a_rotation_that_nobody_says_is_found(folder: Path) -> None:
-    from semcal_ros.config.config import load_config
-
     pictures = []
     with open_recording(folder / "ladder", load_config("generic")) as recording:
         for frame in recording.frames():
@@ -132,6 +133,8 @@ def test_without_a_grid_one_size_is_known(small: Path, capsys: pytest.CaptureFix
     for wrong, said in (
         ((), "without a known size"),
         (("--pixel-size", "9nm@7000", "--length", "1um@0,1,1,60,60"), "two known sizes"),
+        (("--pixel-size", "9nm@7000", "--stage-scale", "1%"), "two known sizes"),
+        (("--stage-scale", "x"), "not a ratio such as"),
         (("--pixel-size", "9nm@x"), "not a pixel size such as"),
         (("--length", "1um@0,1,1"), "not a length such as"),
         (("--pixel-size", "9nm@7000", "--method", "pda"), "--method with --specimen"),
@@ -141,6 +144,34 @@ def test_without_a_grid_one_size_is_known(small: Path, capsys: pytest.CaptureFix
         assert said in refused(capsys, *common, *wrong)
     plain = ("drift", small / "steps", "-o", small / "d.csv")
     assert "only calibrate --specimen" in refused(capsys, *plain, "--pixel-size", "9nm@7000")
+    assert "--stage-scale without --specimen" in refused(capsys, *common[:4], "--stage-scale", "1%")
     assert "--length without --specimen" in refused(
         capsys, *common[:4], "--length", "1um@0,1,1,60,60"
     )
+
+
+@pytest.mark.long
+def test_without_a_grid_the_moves_of_the_stage_are_the_metre(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gold, new = tmp_path / "gold", tmp_path / "cal.yaml"
+    size = ("--views", 4, "--magnification", 3000, "--magnification", 6500, "--size", 256)
+    assert run("simulate", gold, "--plan", "ladder", *size) == 0
+    capsys.readouterr()
+    common = ("calibrate", gold, "-o", new, "--specimen", "--config", "virtual_sem")
+    assert run(*common, "--stage-scale", "0.5%") == 0
+    out = capsys.readouterr()
+    assert "whose 1-sigma of 0.5" in out.err
+    found, truth = Calibration.load(new), preset("jsm820").with_image_size(256, 256)
+    for g in (3000.0, 4000.0, 6000.0):
+        camera, wanted = found.at(g), truth.camera_at(g)
+        ratio = np.divide(camera.pixel_size_m, wanted.pixel_size_m)
+        # The stage of the virtual microscope is exact; a magnification comes back to 0.15 %.
+        np.testing.assert_allclose(ratio, 1.0, atol=4e-3)
+        stated = camera.pixel_size_sigma_m[0] / camera.pixel_size_m[0]
+        assert 0.005 < stated < 0.01
+    # Moved by the beam, or without positions, the pictures tell no metre.
+    with open_recording(gold, load_config("virtual_sem")) as recording:
+        pictures = [(frame.image, frame.magnification) for frame in recording.frames()]
+    with pytest.raises(CalibrationError, match="moves of the stage that tell no length"):
+        calibrate_specimen(pictures, stage_scale=0.005)

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -36,6 +36,7 @@ from tests.helpers.made_once import made_once
 __all__ = [
     "REPEATABILITY",
     "SIZE",
+    "Disturbance",
     "aligned_rms_px",
     "calibration_of",
     "camera_at",
@@ -117,8 +118,31 @@ def take(
     )
 
 
+#: Where the beam lands (n,) x and y, m, when it should land at x and y: of a picture by its number, and by the place
+#: (x, y) of the specimen on the axis, m.
+Disturbance = Callable[[int, tuple[float, float], Array, Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Disturbed(Grains):
+    """Grains that are seen elsewhere."""
+
+    landing: Callable[[Array, Array], tuple[Array, Array]] | None = None
+
+    def brightness(self, x: Array, y: Array, beam_m: float) -> Array:
+        """As of all grains."""
+        assert self.landing is not None
+        return super().brightness(*self.landing(x, y), beam_m)
+
+
 def ladder_of(
-    scope: Scope, magnifications: Sequence[float], seed: int = 0, *, turned: bool = True
+    scope: Scope,
+    magnifications: Sequence[float],
+    seed: int = 0,
+    *,
+    turned: bool = True,
+    disturb: Disturbance | None = None,
+    grains: Grains = _GRAINS,
 ) -> list[LadderPicture]:
     """Three pictures at each magnification, of which the last one is turned."""
     rng = np.random.default_rng([seed, 2])
@@ -128,14 +152,22 @@ def ladder_of(
         for k, move in enumerate([(0.0, 0.0), (0.22, 0.1), (-0.05, 0.2)]):
             turn = 0.5 * math.pi * (-1.0) ** number if turned and k == 2 else 0.0
             place = np.array(move) + rng.normal(0.0, 0.02, 2)
+            where = float(place[0]), float(place[1])
+            seen = grains
+            if disturb is not None:
+                field = scope.display_m / g
+                axis = field * where[0], field * where[1]
+                landing = partial(disturb, len(pictures), axis)
+                seen = Disturbed(grains.seed, grains.sigmas_m, landing=landing)
             image = take(
                 scope,
                 g,
-                (float(place[0]), float(place[1])),
+                where,
                 turn + float(rng.normal(0.0, 0.002)),
                 seed=seed * 100 + len(pictures),
                 visit_scale=visited,
                 drift_m=(rng.normal(0.0, 0.3, 2) * scope.display_m / g / SIZE).tolist(),
+                grains=seen,
             )
             pictures.append(LadderPicture(image, float(g), f"{g:.0f}x/{k}", turn))
     return pictures

@@ -39,7 +39,8 @@ from semcal_ros.viewer.source import DriftPanel, Status, View
 from semcal_ros.viewer.state import describe_magnification
 from tests.helpers.node_scenes import make_calibration, texture
 
-CAMERA = make_calibration().at(2000.0)
+CALIBRATION = make_calibration()
+CAMERA = CALIBRATION.at(2000.0)
 RAW = texture(3).astype(np.uint16) * 16
 MOVING = (((1, 2), (3, 2), (3, 5)),)
 
@@ -65,7 +66,7 @@ class Source:
         return None
 
     def describe(self) -> Status:
-        at = describe_magnification(2000.0, (500.0, 8000.0))
+        at = describe_magnification(2000.0, CALIBRATION)
         return Status("test", "live", at, (), explain([]), DriftPanel("none"), ("reset", "stop"))
 
     def act(self, action: str, value: float | tuple[float, ...] | None) -> str:

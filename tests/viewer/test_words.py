@@ -19,6 +19,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,10 +28,12 @@ import pytest
 
 import semcal_ros
 from semcal_ros.bridge.diagnostics import join_states
+from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.viewer.lengths import format_with_sigma
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
+from tests.helpers.node_scenes import make_calibration
 
 
 def test_nodes_without_trouble_are_one_line() -> None:
@@ -230,14 +233,31 @@ def test_rates_are_of_nodes_that_publish() -> None:
 
 
 def test_the_magnification_says_whether_it_is_covered() -> None:
-    assert describe_magnification(None, (100.0, 1e4)).state == "unknown"
+    calibration = make_calibration()
+    assert calibration.magnification_range == (500.0, 8000.0)
+    assert describe_magnification(None, calibration).state == "unknown"
     assert describe_magnification(5250.0, None).explanation == "not calibrated"
-    inside = describe_magnification(5250.0, (100.0, 1e4))
+    inside = describe_magnification(5250.0, calibration)
     assert (inside.text, inside.state) == ("5250×", "ok")
-    assert inside.explanation == "calibrated, 100× to 10000×"
-    assert describe_magnification(10_000.0, (100.0, 1e4)).state == "ok"
-    outside = describe_magnification(20_000.0, (100.0, 1e4))
+    assert inside.explanation == "calibrated, 500× to 8000×"
+    assert describe_magnification(8000.0, calibration).state == "ok"
+    outside = describe_magnification(20_000.0, calibration)
     assert (outside.text, outside.state) == ("20000×", "outside")
+    assert outside.explanation == "outside the calibration, 500× to 8000×"
+
+
+def test_the_magnification_says_what_calibrated_it() -> None:
+    ladder = replace(make_calibration(), ladder=LadderRecord((500.0, 3000.0), 1e-4))
+    at = {g: describe_magnification(g, ladder) for g in (2000.0, 3000.0, 5000.0, 9000.0)}
+    assert [at[g].state for g in sorted(at)] == ["ok", "ok", "ok", "outside"]
+    by_grid = "calibrated by a grid, 500× to 3000×; by a specimen, 500× to 8000×"
+    assert at[2000.0].explanation == at[3000.0].explanation == by_grid
+    assert at[5000.0].explanation.startswith("calibrated by a specimen")
+    assert at[9000.0].explanation == "outside the calibration, 500× to 8000×"
+    alone = replace(ladder, method="specimen", ladder=LadderRecord((2000.0, 2000.0), 1e-4))
+    assert describe_magnification(2000.0, alone).explanation == (
+        "calibrated by a specimen, 500× to 8000×"
+    )
 
 
 def test_the_drift_is_told_with_its_sigma_and_drawn_with_few_points() -> None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -38,6 +38,7 @@ __all__ = [
     "FUNCTION_NAMES",
     "TERM_NAMES",
     "CalibrationModel",
+    "Origin",
     "ScaleSigma",
     "checked_magnification",
     "design_matrix",
@@ -45,6 +46,8 @@ __all__ = [
     "pixel_size_gradient",
 ]
 
+#: What tells a camera: a grid, a specimen, or neither.
+Origin = Literal["grid", "specimen", "extrapolated"]
 
 # The scale is kept relative to the nominal one, width g / display width, so that it is a number
 # near 1 at every g.
@@ -275,6 +278,16 @@ class CalibrationModel:
                 expected=f"a magnification near the calibrated range {low:g} to {high:g}",
                 do="calibrate there",
             ) from error
+
+    def origin_of(self, magnification: float) -> Origin:
+        """What tells the camera at a magnification: a grid, a specimen, or nothing but the course of the functions."""
+        g = checked_magnification(magnification)
+        low, high = self.magnification_range
+        if not low * (1 - 1e-9) <= g <= high * (1 + 1e-9):
+            return "extrapolated"
+        if self.method == "specimen" or (self.ladder is not None and self.ladder.beyond(g) > 1e-9):
+            return "specimen"
+        return "grid"
 
     def ladder_sigma(self, magnification: float) -> float:
         """Relative 1-sigma of the scale that a ladder adds beyond the grid; 0 without one."""

@@ -63,9 +63,11 @@ __all__ = [
     "LadderStep",
     "RejectedPair",
     "check_fit",
+    "creep_of",
     "describe_ladder",
     "describe_steps",
     "extend_calibration",
+    "find_unrest",
     "make_model",
     "measure_ladder",
 ]
@@ -79,8 +81,13 @@ _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 # Slope of a specimen that is not flat any more: 5 degrees, ten times that of one that is mounted flat.
 _STEEPEST_RAD = 0.0873
 # Residuals of twice their sigma are a model that does not fit, or pictures that do not show one plane.
-_LARGEST_FACTOR = 9.0
+_LARGEST_FACTOR = 4.0
+# A thousand residuals or more have a mean square within 0.15 of 1; interpolation and jitter of lines add some.
+_NOTED_FACTOR = 1.25
 _LEAST_USED = 0.5
+# A creep of so many sigmas is one of 16 000 by chance; what adds up to more than this over a ladder need not be as
+# steady as it is taken to be.
+_CREEP_SIGMAS, _MOST_CREEP = 4.0, 5e-3
 # A turn by less than this is none of the scan, rad; and a shift by less than this part of the field is none.
 _TURNED_RAD, _SHIFTED = 0.5, 0.08
 
@@ -225,7 +232,7 @@ def extend_calibration(
     extended = make_model(measured)
     steps = describe_steps(measured)
     tilt, tilt_sigma = _tilt(setup, fit)
-    weaknesses = _find_weaknesses(model, steps, extended)
+    weaknesses = (*find_unrest(measured), *_find_weaknesses(model, steps, extended))
     notes = describe_ladder(measured) | {"warnings": list(weaknesses)}
     extended = replace(extended, statistics={**model.statistics, "ladder": notes})
     return LadderResult(
@@ -255,6 +262,8 @@ class LadderMeasurement:
         Pixels of the calibration per pixel of the pictures.
     rejected, unused
         Pairs and names of pictures that were not used.
+    numbers
+        Which of the pictures that were given are used.
     """
 
     setup: LadderSetup
@@ -263,6 +272,7 @@ class LadderMeasurement:
     scale: float
     rejected: tuple[RejectedPair, ...]
     unused: tuple[str, ...]
+    numbers: tuple[int, ...]
 
 
 def measure_ladder(
@@ -299,7 +309,7 @@ def measure_ladder(
     ]
     check_fit(setup, fit, links)
     names = tuple(pictures[k].name or f"picture {k}" for k in unused)
-    return LadderMeasurement(setup, fit, tuple(links), scale, tuple(rejected), names)
+    return LadderMeasurement(setup, fit, tuple(links), scale, tuple(rejected), names, tuple(used))
 
 
 def describe_ladder(measured: LadderMeasurement) -> dict[str, object]:
@@ -311,6 +321,7 @@ def describe_ladder(measured: LadderMeasurement) -> dict[str, object]:
         "variance_factor": fit.variance_factor,
         "drift_px": _drift_px(fit) / measured.scale,
         "tilt_rad": _tilt(setup, fit)[0],
+        "creep": fit.state.creep,
         "relays": [[relay.low, relay.high, relay.jump] for relay in _relays(setup, fit)],
         "magnifications": sorted({picture.magnification for picture in setup.pictures}),
     }
@@ -613,6 +624,12 @@ def _tilt(setup: LadderSetup, fit: LadderFit) -> tuple[float, float]:
     return float(np.hypot(*values)), float(spread)
 
 
+def creep_of(setup: LadderSetup, fit: LadderFit) -> tuple[float, float]:
+    """Relative change of the scale from each picture to the next one, and its 1-sigma."""
+    place = setup.bounds[7].start
+    return fit.state.creep, float(np.sqrt(fit.covariance[place, place]))
+
+
 def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None:
     """Refuse a ladder whose specimen is tilted, or whose pictures do not show one plane at rest.
 
@@ -621,13 +638,6 @@ def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None
     CalibrationError
         With what was seen.
     """
-    tilt, sigma = _tilt(setup, fit)
-    if tilt > _STEEPEST_RAD and tilt > 3.0 * sigma:
-        raise CalibrationError(
-            f"a specimen that is tilted by {np.degrees(tilt):.1f} degrees",
-            expected=f"one that lies flat, to {np.degrees(_STEEPEST_RAD):.0f} degrees",
-            do="untilt the stage, and record the ladder again",
-        )
     share = len(fit.kept) / len(links)
     if share < _LEAST_USED or fit.variance_factor > _LARGEST_FACTOR:
         raise CalibrationError(
@@ -635,6 +645,21 @@ def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None
             f"{100.0 * (1.0 - share):.0f} % of them left out",
             expected="pictures of one plane at rest",
             do="use a flat specimen that neither charges nor moves, and wait until the drift has settled",
+        )
+    tilt, sigma = _tilt(setup, fit)
+    if tilt > _STEEPEST_RAD and tilt > 3.0 * sigma:
+        raise CalibrationError(
+            f"a specimen that is tilted by {np.degrees(tilt):.1f} degrees",
+            expected=f"one that lies flat, to {np.degrees(_STEEPEST_RAD):.0f} degrees",
+            do="untilt the stage, and record the ladder again",
+        )
+    creep, creep_sigma = creep_of(setup, fit)
+    pictures = len(setup.pictures)
+    if abs(creep) > _CREEP_SIGMAS * creep_sigma and abs(creep) * pictures > _MOST_CREEP:
+        raise CalibrationError(
+            f"a scale that creeps by {100.0 * creep:+.3f} +- {100.0 * creep_sigma:.3f} % from picture to picture",
+            expected=f"less than {100.0 * _MOST_CREEP:g} % over all {pictures} pictures",
+            do="use a specimen that does not charge, and wait until the microscope has settled",
         )
     linked = {number for k in fit.kept for number in (links[k].first, links[k].second)}
     alone = [setup.pictures[k].name for k in range(len(setup.pictures)) if k not in linked]
@@ -768,6 +793,24 @@ def describe_steps(measured: LadderMeasurement) -> tuple[LadderStep, ...]:
             LadderStep(g, len(numbers), int(np.count_nonzero(turned)), own[g], below[g], float(rms))
         )
     return tuple(steps)
+
+
+def find_unrest(measured: LadderMeasurement) -> tuple[str, ...]:
+    """What shows that the specimen or the microscope was not quite at rest, in sentences."""
+    setup, fit = measured.setup, measured.fit
+    found = []
+    if fit.variance_factor > _NOTED_FACTOR:
+        found.append(
+            f"pictures disagree by {np.sqrt(fit.variance_factor):.1f} times what their noise explains, which the "
+            "stated uncertainty contains: a part of the specimen moves, it charges, or it is not flat"
+        )
+    creep, sigma = creep_of(setup, fit)
+    if abs(creep) > _CREEP_SIGMAS * sigma:
+        found.append(
+            f"the scale creeps by {100.0 * creep:+.3f} +- {100.0 * sigma:.3f} % from picture to picture, which was "
+            "taken out: the specimen charges, or the microscope has not settled"
+        )
+    return tuple(found)
 
 
 def _find_weaknesses(

@@ -17,7 +17,7 @@
 Moved pictures tell the distortion, turned scans aspect and skew, and zooms the ratios of the scales, as in a ladder
 beyond a grid (:mod:`semcal_ros.core.ladder.extend`). Nothing of that knows a metre: all places on the specimen, and all
 pixel sizes, may be multiplied by one number. So the adjustment is made with a scale that is held, and the pixel size
-that is known at one magnification multiplies it afterwards.
+that is known at one magnification multiplies it afterwards. It may come from a length, or from the moves of a stage.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from itertools import pairwise
 import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive, check_range
+from semcal_ros.core.calibration.stage import fit_stage_moves
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.ladder_record import LadderRecord
@@ -36,20 +37,24 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.extend import (
     LARGEST_STEP,
+    LadderMeasurement,
     LadderPicture,
     LadderStep,
     RejectedPair,
     describe_ladder,
     describe_steps,
+    find_unrest,
     make_model,
     measure_ladder,
 )
+from semcal_ros.core.ladder.unknowns import LadderSetup
 
 __all__ = [
     "METHOD",
     "KnownLength",
     "ScaleAnchor",
     "SpecimenCalibration",
+    "StageMoves",
     "calibrate_from_specimen",
 ]
 
@@ -75,6 +80,10 @@ _SLOPES = {
 _HELD = 1e-6
 # Principal point, in image widths, and pivot (1/m), which flat pictures do not show: as in a calibration by a grid.
 _PRINCIPAL_POINT, _PIVOT, _PIVOT_SIGMA = 0.08, 50.0, 60.0
+# Moves that tell the length worse than this tell nothing that --pixel-size by the display width does not.
+_MOST_STAGE_SIGMA = 0.05
+# Cosine of a turn of the scan beyond which its centre counts: one degree.
+_ONE_TURN = 0.99985
 # A place that is pointed at by hand is known to half a pixel; a length of fewer pixels than these says too little.
 _EDGE_SIGMA_PX, _LEAST_LENGTH_PX = 0.5, 20.0
 # How well a magnification comes back where nothing tells it, and the height of what is measured, m: as there.
@@ -159,6 +168,114 @@ class KnownLength:
 
 
 @dataclass(frozen=True, eq=False)
+class StageMoves:
+    """Where a trusted stage was at each picture.
+
+    Attributes
+    ----------
+    position_m
+        (M, 2) x and y of the stage without tilt; not finite where it was not known.
+    time_s
+        (M,) when the pictures were taken.
+    sigma
+        Relative 1-sigma of the length of a move.
+    """
+
+    position_m: Array
+    time_s: Array
+    sigma: float
+
+    def __post_init__(self) -> None:
+        check_range(self.sigma, "relative 1-sigma of the moves of a stage", 1e-6, 0.2)
+        if self.position_m.shape != (len(self.time_s), 2):
+            raise InvalidValueError(
+                f"positions of the shape {self.position_m.shape} at {len(self.time_s)} times",
+                expected="x and y for each",
+            )
+
+    def as_anchor(self, measured: LadderMeasurement, numbers: Sequence[int]) -> ScaleAnchor:
+        """The pixel size that the moves mean, at the lowest magnification, where they are longest.
+
+        Where the pictures lie on the specimen is compared with where the stage was: a turn or a reflection, one length,
+        and a steady drift (:func:`.fit_stage_moves`). Only moves at one magnification with one rotation of the scan are
+        compared: about which pixel a scan turns and zooms is not known.
+
+        Parameters
+        ----------
+        measured
+            A ladder whose scale is held.
+        numbers
+            Which of the pictures each of its pictures is.
+
+        Raises
+        ------
+        CalibrationError
+            If the stage is known for too few pictures, or did not move with them.
+        """
+        setup, poses = measured.setup, measured.fit.state.poses
+        pixels = np.array([setup.pixel_m(picture.magnification) for picture in setup.pictures])
+        cos, sin = np.cos(poses[:, 0]), np.sin(poses[:, 0])
+        shift = pixels[:, None] * poses[:, 1:3]
+        # The place in the middle: what is seen at x is R x + shift.
+        places = -np.stack(
+            [cos * shift[:, 0] + sin * shift[:, 1], cos * shift[:, 1] - sin * shift[:, 0]], axis=1
+        )
+        position, time = self.position_m[list(numbers)], self.time_s[list(numbers)]
+        position, places, time, lost = _within_levels(setup, poses[:, 0], position, places, time)
+        try:
+            found = fit_stage_moves(position, places, time, 1.0)
+            freedom = (len(time) - 4.0) / check_positive(len(time) - 3.0 - lost, "spare moves")
+        except InvalidValueError as error:
+            raise CalibrationError(
+                f"moves of the stage that tell no length: {error}",
+                expected="x and y of an untilted stage for five pictures or more, moved by it and not by the beam",
+                do="give --pixel-size or --length instead",
+            ) from error
+        ratios = 1.0 + np.array([found.scale_x, found.scale_y])
+        # The places of the middles take freedom, too.
+        spreads = np.sqrt(freedom) * np.array([found.scale_x_sigma, found.scale_y_sigma])
+        weights = (
+            spreads**-2.0 / np.sum(spreads**-2.0) if np.all(spreads > 0.0) else np.full(2, 0.5)
+        )
+        ratio = float(weights @ ratios)
+        fitted = float(np.sqrt(np.sum((weights * spreads) ** 2))) / ratio
+        if not fitted < _MOST_STAGE_SIGMA or abs(ratios[1] - ratios[0]) > 5.0 * np.hypot(
+            np.hypot(*spreads), 2.0 * self.sigma
+        ):
+            raise CalibrationError(
+                f"moves of the stage that do not fit the pictures: {100.0 * ratios[0]:.1f} % of their length along x, "
+                f"{100.0 * ratios[1]:.1f} % along y, +- {100.0 * fitted:.1f} %",
+                expected="a stage that says where it is, and pictures that were moved by it, not by the beam",
+                do="give --pixel-size or --length instead",
+            )
+        g = min(picture.magnification for picture in setup.pictures)
+        row = setup.design(g)[0] @ measured.fit.state.theta
+        return ScaleAnchor(1.0 / (float(row) * ratio), g, float(np.hypot(self.sigma, fitted)))
+
+
+def _within_levels(
+    setup: LadderSetup, angles: Array, position: Array, places: Array, time: Array
+) -> tuple[Array, Array, Array, int]:
+    """Positions, places and times of pictures from the mean of their level, and the number of levels.
+
+    A level has the pictures of one magnification that are not turned against its first one and whose position is known.
+    """
+    magnifications = np.array([picture.magnification for picture in setup.pictures])
+    known = np.all(np.isfinite(position), axis=1)
+    rows: list[Array] = []
+    count = 0
+    for g in np.unique(magnifications):
+        own = np.flatnonzero(known & (magnifications == g))
+        own = own[np.cos(angles[own] - angles[own[:1]]) > _ONE_TURN]
+        if len(own) > 1:
+            level = np.column_stack([position[own], places[own], time[own]])
+            rows.append(level - level.mean(axis=0))
+            count += 1
+    table = np.concatenate(rows) if rows else np.empty((0, 5))
+    return table[:, :2], table[:, 2:4], table[:, 4], count
+
+
+@dataclass(frozen=True, eq=False)
 class SpecimenCalibration:
     """A calibration without a grid.
 
@@ -181,7 +298,7 @@ class SpecimenCalibration:
 
 def calibrate_from_specimen(
     pictures: Sequence[LadderPicture],
-    known: ScaleAnchor | KnownLength,
+    known: ScaleAnchor | KnownLength | StageMoves,
     *,
     display_width_m: float,
     timing: ScanTiming | None = None,
@@ -194,7 +311,8 @@ def calibrate_from_specimen(
     pictures
         As for :func:`.extend_calibration`, at three magnifications or more.
     known
-        One known pixel size, at a magnification within the range of the pictures, or a known length in one of them.
+        One known pixel size, at a magnification within the range of the pictures, or a known length in one of them,
+        or where a stage was whose moves are known.
     display_width_m
         Display width that magnifications refer to.
     timing, on_progress
@@ -203,7 +321,7 @@ def calibrate_from_specimen(
     Raises
     ------
     CalibrationError
-        As there, or if there are fewer than three magnifications.
+        As there, or if there are fewer than three magnifications, or the moves of the stage do not fit.
     InvalidValueError
         If the pictures differ in size, or the anchor is not one of their range.
     """
@@ -223,6 +341,16 @@ def calibrate_from_specimen(
             )
     if isinstance(known, ScaleAnchor):
         anchor = known
+    elif isinstance(known, StageMoves):
+        if len(known.time_s) != len(pictures):
+            raise InvalidValueError(
+                f"{len(known.time_s)} positions of the stage for {len(pictures)} pictures",
+                expected="one for each",
+            )
+        # Any scale: the moves correct it when the places of the pictures are known.
+        anchor = ScaleAnchor(
+            display_width_m / seen[0] / pictures[0].image.shape[1], seen[0], known.sigma
+        )
     else:
         if not 0 <= known.picture < len(pictures):
             raise InvalidValueError(
@@ -242,9 +370,11 @@ def calibrate_from_specimen(
     model = make_model(measured)
     if isinstance(known, KnownLength):
         anchor = known.as_anchor(model, anchor.magnification)
+    elif isinstance(known, StageMoves):
+        anchor = known.as_anchor(measured, measured.numbers)
     model = _anchored(model, anchor)
     steps = describe_steps(measured)
-    weaknesses = _find_weaknesses(steps, anchor, model)
+    weaknesses = (*find_unrest(measured), *_find_weaknesses(steps, anchor, model))
     notes = describe_ladder(measured) | {"warnings": list(weaknesses)}
     statistics = {
         "ladder": notes,

@@ -271,6 +271,7 @@ def pair_rows(state: LadderState, link: Link) -> PairRows:
     total = np.zeros((count, 2, functions.shape[1]))
     visits: dict[int, tuple[Array, Array]] = {}
     nothing = np.zeros((count, 2))
+    crept = np.zeros((count, 2, 1))
     for number, seen in ((first, here), (second, there)):
         by_camera, by_pose, by_drift = seen.by_camera, seen.by_pose, seen.by_drift
         if number == first:
@@ -283,6 +284,7 @@ def pair_rows(state: LadderState, link: Link) -> PairRows:
         total += by_camera @ design
         visit = int(setup.visit_of[number])
         by_scale = by_camera[:, :, 0] * (state.parameters[number, 0] / scale)
+        crept[:, :, 0] += setup.order[number] * by_scale
         before = visits.get(visit, (nothing, np.zeros((count, 2, 2))))
         visits[visit] = before[0] + by_scale, before[1] + by_drift
         start = setup.bounds[5].start + POSE_SIZE * number
@@ -293,6 +295,7 @@ def pair_rows(state: LadderState, link: Link) -> PairRows:
         blocks.append((np.array([setup.bounds[3].start + visit]), by_scale[:, :, None]))
         start = setup.bounds[6].start + 2 * visit
         blocks.append((np.arange(start, start + 2), by_drift))
+    blocks.append((np.arange(setup.bounds[7].start, setup.bounds[7].stop), crept))
     columns = np.concatenate([np.arange(functions.shape[1]), *(part for part, _ in blocks)])
     jacobian = np.concatenate([total, *(values for _, values in blocks)], axis=2)
     residual = link.second_xy - there.xy

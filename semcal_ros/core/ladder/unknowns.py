@@ -26,6 +26,10 @@ The specimen is a plane. What lies at x on it, in m, is seen by picture i at
 in the sem frame, at the height ``slope . x``; tau is the time of the pixel from -1/2 to 1/2 of the frame. The drift of
 a visit turns with the specimen, and that of a picture differs from it by its change: a stretch of all pictures that
 does not turn is the camera's.
+
+The scale may creep, by the same part from each picture to the next one: a specimen that charges more and more does so,
+and a lens or a high tension that warms up. Along a ladder that adds up as a wrong scale of all of its steps would; the
+pictures of one magnification tell the two apart.
 """
 
 from __future__ import annotations
@@ -164,6 +168,15 @@ class LadderSetup:
             [self.visits.index(picture.visit) for picture in self.pictures], dtype=np.intp
         )
 
+    @cached_property
+    def order(self) -> Array:
+        """(M,) number of each picture, from the middle of those in the range that was calibrated before."""
+        low, high = self.model.magnification_range
+        g = np.array([picture.magnification for picture in self.pictures])
+        inside = np.flatnonzero((g >= low * (1.0 - 1e-6)) & (g <= high * (1.0 + 1e-6)))
+        middle = float(inside.mean()) if len(inside) else 0.0
+        return np.arange(len(g), dtype=np.float64) - middle
+
     def design(self, magnification: float) -> Array:
         """(P, K) from the coefficients to the parameters of the camera."""
         if magnification not in self._designs:
@@ -180,8 +193,8 @@ class LadderSetup:
         return 1.0 / self.model.nominal_px_per_m(magnification)
 
     @cached_property
-    def bounds(self) -> tuple[slice, slice, slice, slice, slice, slice, slice]:
-        """Where components, bends, jumps, visits, slopes, poses and drifts of visits stand among the unknowns."""
+    def bounds(self) -> tuple[slice, slice, slice, slice, slice, slice, slice, slice]:
+        """Where components, bends, jumps, visits, slopes, poses, drifts and creep stand among the unknowns."""
         sizes = (
             self.root.shape[1],
             len(self.bend_columns),
@@ -190,10 +203,11 @@ class LadderSetup:
             2,
             POSE_SIZE * len(self.pictures),
             2 * len(self.visits),
+            1,
         )
         ends = np.cumsum([0, *sizes]).tolist()
-        first, second, third, fourth, fifth, sixth, last = (slice(a, b) for a, b in pairwise(ends))
-        return first, second, third, fourth, fifth, sixth, last
+        one, two, three, four, five, six, seven, last = (slice(a, b) for a, b in pairwise(ends))
+        return one, two, three, four, five, six, seven, last
 
     @property
     def size(self) -> int:
@@ -245,8 +259,15 @@ class LadderState:
 
     @cached_property
     def visit_scales(self) -> Array:
-        """(M,) relative deviation of the scale of each picture in its visit."""
-        return self.values[self.setup.bounds[3]][self.setup.visit_of]
+        """(M,) relative deviation of the scale of each picture in its visit, with the creep up to it."""
+        setup = self.setup
+        own = self.values[setup.bounds[3]][setup.visit_of]
+        return np.asarray(own + self.creep * setup.order)
+
+    @property
+    def creep(self) -> float:
+        """Relative change of the scale from each picture to the next one."""
+        return float(self.values[self.setup.bounds[7]][0])
 
     @property
     def poses(self) -> Array:
@@ -288,10 +309,11 @@ def extend_functions(
         old = own.extension
         if name not in _UNSEEN:
             if len(old) and (old[-1] > old[0]) != (knots[-1] > knots[0]):
+                side = "upwards" if knots[-1] > knots[0] else "downwards"
                 raise InvalidValueError(
-                    "a calibration that was extended to the other side",
+                    f"a ladder {side} for a calibration that was extended to the other side",
                     expected="one that was extended to this side, or not at all",
-                    do="extend the calibration of the grid once, in this direction",
+                    do="extend the calibration of the grid to this side, into a file of its own",
                 )
             added = knots[1:] if len(old) else knots
             old = np.concatenate([old, added])
@@ -320,7 +342,7 @@ def make_setup(
         raise InvalidValueError(
             f"a ladder from {seen[0]:g}x to {seen[-1]:g}x for a calibration of {low:g}x to {high:g}x",
             expected="one that goes beyond one end of it",
-            do="extend upwards and downwards one after the other",
+            do="leave out the pictures beyond its other end",
         )
     outwards = above or below[::-1]
     knots = np.array([high if above else low, *outwards])

@@ -26,12 +26,13 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.html.encode import Readings
-from semcal_ros.report.html.style import SECOND
+from semcal_ros.report.html.style import INK, SECOND
 from semcal_ros.report.html.text import format_magnification
 
 __all__ = [
     "draw_curve",
     "mark_magnifications",
+    "parts_by_specimen",
     "read_curve",
     "sample_cameras",
     "sample_cameras_around",
@@ -69,8 +70,30 @@ def _find_camera(model: CalibrationModel, g: float) -> ScanCamera | None:
         return None
 
 
+def parts_by_specimen(model: CalibrationModel) -> list[tuple[float, float]]:
+    """The parts of the calibrated range that a specimen tells, not a grid: (lowest, highest) of each."""
+    low, high = model.magnification_range
+    if model.ladder is None:
+        return []
+    if model.method == "specimen":
+        return [(low, high)]
+    first, last = model.ladder.anchored
+    return [(start, end) for start, end in ((low, first), (last, high)) if start < end]
+
+
 def mark_magnifications(axes: Axes, model: CalibrationModel) -> None:
-    """Mark the magnifications of the images on the x axis."""
+    """Mark the magnifications of the images on the x axis, and shade where a specimen tells them, not a grid."""
+    for start, end in parts_by_specimen(model):
+        axes.axvspan(start, end, facecolor=SECOND, alpha=0.08, linewidth=0.0, zorder=0)
+        axes.text(
+            float(np.sqrt(start * end)),
+            0.03,
+            "specimen",
+            transform=axes.get_xaxis_transform(),
+            ha="center",
+            fontsize=7,
+            color=INK,
+        )
     g = np.array(model.magnifications)
     axes.plot(
         g,

@@ -43,6 +43,7 @@ from semcal_ros.report.calibration.coverage_figures import (
     plot_tilt_directions,
     plot_tilts,
 )
+from semcal_ros.report.calibration.curves import parts_by_specimen
 from semcal_ros.report.calibration.examples import (
     choose_examples,
     overlay_corners,
@@ -251,7 +252,7 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
         (
             "Magnification",
             span,
-            f"{len(model.magnifications)} calibrated, continuous in between"
+            f"{len(model.magnifications)} calibrated, continuous in between{_describe_origin(model)}"
             if high > low
             else "the only one calibrated",
         ),
@@ -259,6 +260,12 @@ def _summarise(result: CalibrationResult, rejected: int) -> list[tuple[str, str,
         ("Views", f"{len(result.views)} used", f"{rejected} rejected"),
         ("Corners", f"{corners}", f"{corners / len(result.views):.0f} per view"),
     ]
+
+
+def _describe_origin(model: CalibrationModel) -> str:
+    """Which part of the range a specimen tells, not a grid; empty where there is none."""
+    parts = [f"{low:g}× to {high:g}×" for low, high in parts_by_specimen(model)]
+    return f"; {' and '.join(parts)} by a specimen, the rest by a grid" if parts else ""
 
 
 def _span_nm(result: CalibrationResult, rms_px: Mapping[float, float]) -> str:

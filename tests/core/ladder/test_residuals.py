@@ -55,7 +55,7 @@ def _with_terms(model: CalibrationModel) -> CalibrationModel:
 
 def _random_state(setup: LadderSetup, seed: int = 0) -> LadderState:
     rng = np.random.default_rng(seed)
-    components, bends, jumps, visits, slopes, poses, drifts = setup.bounds
+    components, bends, jumps, visits, slopes, poses, drifts, creep = setup.bounds
     values = start_state(setup).values.copy()
     values[components] += rng.normal(size=components.stop - components.start)
     values[bends] += 0.1 * setup.bend_sigmas * rng.normal(size=len(setup.bend_sigmas))
@@ -65,6 +65,7 @@ def _random_state(setup: LadderSetup, seed: int = 0) -> LadderState:
     pose = np.array([1.0, 20.0, 20.0, 0.5, 0.5])
     values[poses] += (pose * rng.normal(size=(len(setup.pictures), 5))).ravel()
     values[drifts] += rng.normal(size=drifts.stop - drifts.start)
+    values[creep] = 2e-4
     return LadderState(setup, values)
 
 
