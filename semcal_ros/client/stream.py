@@ -189,6 +189,7 @@ def _read_drift(message: PoseWithCovarianceStamped) -> tuple[Array, Array]:
 
 def _explain(frame: StreamFrame, projection: Array) -> str:
     """Say why lengths of a frame mean nothing; empty where they do."""
-    if projection[0, 0] > 0.0 and not frame.mixed:
+    # A node that starts late may get frames before the magnification that was set earlier.
+    if projection[0, 0] > 0.0 and not frame.mixed and frame.magnification is not None:
         return ""
     return describe_missing_camera(frame.magnification, mixed=frame.mixed)

@@ -42,6 +42,7 @@ SUITE = (
     "parameter_server",
     "rectifier",
     "stream_corrector",
+    "suite",
     "virtual_sem",
     "visual_servo",
 )

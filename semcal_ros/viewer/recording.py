@@ -351,10 +351,10 @@ class RecordingSource:
 
 def _outline_moving(update: DriftUpdate, corrected: NDArray[Any]) -> Outlines:
     """Outlines of what did not move with the specimen, in the corrected picture."""
-    if update.moving is None:
+    if update.moving is None and update.fixed is None:
         return ()
     height, width = corrected.shape[:2]
-    return outline(update.moving.draw((width, height), moved_px=-update.drift_px))
+    return outline(update.draw_apart((width, height)))
 
 
 def _sigma_m(estimate: DriftEstimate) -> float:

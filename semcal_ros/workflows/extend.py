@@ -140,12 +140,19 @@ def read_ladder(
         advance = count_frames(on_progress, "reading", opened.frame_count)
         for index, frame in enumerate(opened.frames()):
             name = frame.file_name or f"frame {index}"
-            conditions.add(frame)
+            conditions.add(_without_turn(frame))
             pictures.append(_picture(frame, name))
             frames[name] = replace(frame, image=frame.image[:0])
             advance(1)
         notes = (*opened.notes, *conditions.notes)
     return SeenLadder(tuple(pictures), frames, notes)
+
+
+def _without_turn(frame: RecordedFrame) -> RecordedFrame:
+    """The frame as the conditions of a grid's recording are told: the scans of a ladder are turned on purpose."""
+    if frame.conditions is None:
+        return frame
+    return replace(frame, conditions=replace(frame.conditions, scan_rotation_rad=None))
 
 
 def _picture(frame: RecordedFrame, name: str) -> LadderPicture:

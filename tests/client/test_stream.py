@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from std_msgs.msg import Float64
 from semcal_ros.bridge.drift import fill_drift
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.client import CalibratedFrame, CalibratedStream
+from semcal_ros.client.stream import _explain
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from tests.helpers.node_scenes import (
@@ -170,3 +172,10 @@ def test_parts_of_the_loop_before_do_not_meet_the_pictures_of_this_one(bench: Be
         bench.wait(3 * loop + 2)
     drifts = [round(frame.drift_m[0] * 1e9) for frame in bench.frames]
     assert drifts == [0, 0, 1, 1, 1, 2, 2, 2]
+
+
+def test_a_frame_whose_magnification_is_not_known_yet_is_not_valid() -> None:
+    frame: Any = SimpleNamespace(mixed=False, magnification=None)
+    assert "its magnification is not known" in _explain(frame, np.eye(3, 4))
+    frame.magnification = 2000.0
+    assert _explain(frame, np.eye(3, 4)) == ""

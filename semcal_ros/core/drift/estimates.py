@@ -22,6 +22,7 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -211,9 +212,9 @@ class DriftUpdate(DriftEstimate):
     moving
         What does not move with the specimen, in px of the rectified frame before its drift is removed; None where
         nothing was found.
-    fixed_share
-        Part of the frame that stays in place while the specimen drifts, such as a data bar or a burnt spot of the
-        detector, and was left out.
+    fixed
+        What stays in place while the specimen drifts, such as a data bar or a burnt spot of the detector, and was left
+        out; in the same px. None where nothing was found.
     of_scale
         (2, 2) the part of the covariance of the drift that is due to the scale of the camera, which changes metres and
         not pixels.
@@ -234,13 +235,30 @@ class DriftUpdate(DriftEstimate):
     along: Array | None = field(default=None, kw_only=True)
     unseen: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     moving: MovingTiles | None = field(default=None, kw_only=True)
-    fixed_share: float = field(default=0.0, kw_only=True)
+    fixed: MovingTiles | None = field(default=None, kw_only=True)
     of_scale: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 
     @property
     def accepted(self) -> bool:
         """Whether the drift rests on this frame's own image."""
         return self.rejection is None
+
+    @property
+    def fixed_share(self) -> float:
+        """Part of the frame that stays in place."""
+        return 0.0 if self.fixed is None else self.fixed.share
+
+    def draw_apart(self, size: tuple[int, int], *, scale: float = 1.0) -> NDArray[np.uint8]:
+        """(height, width) 255 where the corrected frame of (width, height) shows what does not move with the specimen:
+        what moves otherwise, and what stays in place. ``scale`` is that of the frame against what was measured.
+        """
+        width, height = size
+        drawn = np.zeros((height, width), dtype=np.uint8)
+        drift_px = self.px_from_unit @ self.drift_m
+        for part in (self.moving, self.fixed):
+            if part is not None:
+                drawn |= part.draw(size, moved_px=-drift_px, scale=scale)
+        return drawn
 
     @property
     def reason(self) -> str:

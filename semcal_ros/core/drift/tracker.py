@@ -79,6 +79,7 @@ from semcal_ros.core.drift.similarity import (
 from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import similarity_matrix
+from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.register import Registration, register
@@ -998,6 +999,6 @@ def _make_update(
         unseen=unseen,
         along=track.along,
         moving=None if registration is None else registration.moving,
-        fixed_share=0.0 if frame.fixed is None else float(np.mean(frame.fixed)),
+        fixed=None if frame.fixed is None else MovingTiles.of_pixels(frame.fixed),
         of_scale=of_scale[:2, :2],
     )

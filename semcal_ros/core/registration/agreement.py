@@ -43,6 +43,8 @@ __all__ = ["Agreement", "MovingTiles", "TileNoise", "find_agreement", "informati
 _MISSING, _BESIDES = 0.4, 0.6
 # Standard deviations of the noise by which it must exceed that: once in 10^5 tiles that agree.
 _SIGMAS = 4.5
+# Tiles into which pixels are gathered that are only to be shown.
+_PIXEL_TILES_PX = 8
 # A shift of a tile of its own, px: distortion and interpolation leave some hundredths.
 _OWN_SHIFT_PX = 0.15
 # Part of the tiles that fit best.
@@ -312,6 +314,17 @@ class MovingTiles:
         """From the tiles that disagree: a body has no holes, and is more than one tile."""
         filled = _fill(_keep_bodies(disagrees, _LEAST_TILES))
         return cls(filled, corner_px, side_px, float(filled.mean()))
+
+    @classmethod
+    def of_pixels(cls, mask: Mask) -> MovingTiles:
+        """From the pixels of an image (h, w), in tiles of 8 px of which one pixel is enough; the share is that of the
+        pixels.
+        """
+        side = _PIXEL_TILES_PX
+        grown = np.pad(mask, [(0, -n % side) for n in mask.shape])
+        rows, cols = (n // side for n in grown.shape)
+        tiles = grown.reshape(rows, side, cols, side).any(axis=(1, 3))
+        return cls(tiles, np.zeros(2), np.full(2, float(side)), float(mask.mean()))
 
     def draw(
         self, size: tuple[int, int], *, moved_px: Array | None = None, scale: float = 1.0

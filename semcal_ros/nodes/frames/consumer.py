@@ -176,7 +176,11 @@ class Consumer:
         try:
             self._call(frame)
             self.trouble = ""
-        except (Exception, SystemExit) as error:  # whatever the code of others may raise
+        except (
+            Exception,
+            SystemExit,
+            KeyboardInterrupt,
+        ) as error:  # whatever the code of others may raise
             self.fail(error)
         if self._waiting:
             self.part.post(self._on_arrival)

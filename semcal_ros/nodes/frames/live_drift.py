@@ -115,12 +115,7 @@ class FrameDrift:
 
     def draw_moving(self, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Return an image (height, width), 255 where the corrected frame shows what does not move with the specimen."""
-        moving = self.measured.moving
-        if moving is None:
-            width, height = size
-            return np.zeros((height, width), dtype=np.uint8)
-        drift_px = self.measured.px_from_unit @ self.measured.drift_m
-        return moving.draw(size, moved_px=-drift_px, scale=float(self.binned))
+        return self.measured.draw_apart(size, scale=float(self.binned))
 
 
 class LiveDrift:

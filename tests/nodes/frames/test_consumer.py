@@ -50,6 +50,11 @@ def leave(frame: CalibratedFrame) -> None:
     sys.exit("no more")
 
 
+def interrupt(frame: CalibratedFrame) -> None:
+    see(frame)
+    raise KeyboardInterrupt("not by a user")
+
+
 class WithNode:
     def __init__(self, node: Any) -> None:
         self.name = node.get_fully_qualified_name()
@@ -109,6 +114,7 @@ def run(consumer: Consumer, count: int) -> None:
         ("WithNode", 0, ""),
         ("stumble", 3, "ZeroDivisionError: frame 5"),
         ("leave", 6, "SystemExit: no more"),
+        ("interrupt", 6, "KeyboardInterrupt: not by a user"),
     ],
 )
 def test_every_frame_comes_whatever_is_raised(
