@@ -323,7 +323,7 @@ class MovingTiles:
         side = _PIXEL_TILES_PX
         grown = np.pad(mask, [(0, -n % side) for n in mask.shape])
         rows, cols = (n // side for n in grown.shape)
-        tiles = grown.reshape(rows, side, cols, side).any(axis=(1, 3))
+        tiles = np.asarray(grown.reshape(rows, side, cols, side).any(axis=(1, 3)))
         return cls(tiles, np.zeros(2), np.full(2, float(side)), float(mask.mean()))
 
     def draw(
