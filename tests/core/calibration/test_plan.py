@@ -99,9 +99,12 @@ def test_a_target_that_is_met_needs_nothing(poor: CalibrationModel) -> None:
 
 
 def test_it_stops_at_the_target(poor: CalibrationModel) -> None:
-    planned = plan(poor, 0.004, 10)
+    one, two, three = (visit.largest for visit in plan(poor, 1e-6, 3).visits)
+    target = float(np.sqrt(two * three))
+    assert three < target < two < one
+    planned = plan(poor, target, 10)
     assert planned.reached
-    assert planned.visits[-1].largest <= 0.004 < planned.visits[-2].largest
+    assert [visit.largest for visit in planned.visits] == pytest.approx([one, two, three])
 
 
 def test_squares_fit_the_field(poor: CalibrationModel) -> None:

@@ -18,11 +18,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.registration.register import prepare_reference, register
 
 
+@pytest.mark.long
 def test_few_particles_reach_the_bound_with_a_sigma_that_holds() -> None:
     scores, sigmas, bounds = [], [], []
     for seed in range(300, 308):

@@ -271,6 +271,7 @@ def test_focal_length_and_its_interval() -> None:
     parallel: Any = SimpleNamespace(
         magnification_range=(400.0, 400.0),
         magnifications=(400.0,),
+        ladder=None,
         nominal_px_per_m=lambda g: g * SIZE / 0.12,
         at=lambda _: replace(camera, rho=0.0),
     )
