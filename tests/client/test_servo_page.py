@@ -110,6 +110,7 @@ def stage() -> Iterator[Stage]:
 
 
 @pytest.mark.parametrize("kind", long_but(lambda kind: kind == "Servo", ("Servo", "JointServo")))
+@pytest.mark.long
 def test_the_bead_comes_to_the_middle(
     stage: Stage, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

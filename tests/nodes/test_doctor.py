@@ -119,6 +119,7 @@ def _examine(peer: Peer, arguments: tuple[str, ...], tick: Callable[[], Any]) ->
     return Report(process.returncode, output)
 
 
+@pytest.mark.long
 def test_a_sound_system_has_no_problem(peer: Peer, calibration_file: str) -> None:
     scene = {"width": 96, "height": 96, "rate": 10.0, "magnification": 1000.0}
     known = {"calibration": calibration_file}
@@ -224,6 +225,7 @@ def test_a_calibration_that_does_not_fit_and_a_clock_nobody_uses_are_named(
     assert report.has("note", "/sem/rectifier", "outside the calibrated range")
 
 
+@pytest.mark.long
 def test_nothing_but_an_image_elsewhere(peer: Peer) -> None:
     peer.node.create_publisher(Image, "/camera/image_raw", RELIABLE)
     report = examine(peer)

@@ -106,6 +106,7 @@ def _check_after_restart(bench: Bench, stream: Stream, killed_at_s: int, waiting
 @pytest.mark.parametrize(
     "kind", long_but(lambda kind: kind.node == "rectifier", KINDS), ids=lambda kind: kind.node
 )
+@pytest.mark.long
 def test_a_killed_stream_node_finds_its_way_back(
     peer: Peer, kind: Kind, calibration_file: Path
 ) -> None:

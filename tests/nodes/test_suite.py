@@ -135,7 +135,10 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 def test_frames_go_from_node_to_node_and_nothing_is_published_to_nobody(suite: Running) -> None:
     suite.wait_for_more("good", 5)
     # Each node says itself who listens: the corrector to the source, and nobody to the corrector.
-    assert suite.state("subscribers.image_raw", "/sem/virtual_sem") == 1
+    suite.peer.wait_for(
+        lambda: suite.state("subscribers.image_raw", "/sem/virtual_sem") == 1, "diagnostics"
+    )
+    suite.peer.wait_for(lambda: suite.state("dropped", "/sem/stream_corrector") >= 0, "diagnostics")
     assert suite.state("subscribers.image_rect", "/sem/stream_corrector") == 0
     assert suite.state("dropped", "/sem/stream_corrector") == 0
     assert suite.peer.node.count_subscribers("/sem/image_raw") == 0
@@ -175,6 +178,7 @@ def test_parameters_are_those_of_the_chain(suite: Running) -> None:
     suite.wait_for_more("good", 2)
 
 
+@pytest.mark.long
 def test_a_new_magnification_reaches_its_own_frames(suite: Running) -> None:
     knob = suite.peer.node.create_publisher(Float64, "virtual_sem/set_magnification", 10)
     suite.peer.wait_for(knob.get_subscription_count, "the knob")
@@ -206,6 +210,7 @@ def test_a_consumer_that_raises_stops_nobody(suite: Running) -> None:
     assert 1 <= suite.process.output.count("OSError: no stage") < suite.state("consumer.bad.failed")
 
 
+@pytest.mark.long
 def test_a_killed_suite_that_is_started_again_goes_on(suite: Running) -> None:
     assert suite.process.stop(signal.SIGKILL) == -signal.SIGKILL
     suite.process.close()

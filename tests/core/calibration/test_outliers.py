@@ -78,6 +78,7 @@ def test_ordinary_views_stay(name):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_jump_of_the_scale_is_not_a_matter_of_single_views():
     views = [
         replace(v, board_xy_m=v.board_xy_m / 1.03) if v.magnification > 3000.0 else v

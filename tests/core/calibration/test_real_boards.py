@@ -26,7 +26,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import views_from_detections
 from tests.helpers.corner_boards import seen_photograph
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 SIZE = (640, 480)
 

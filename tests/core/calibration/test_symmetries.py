@@ -89,6 +89,7 @@ def test_twice_as_many_pixels_see_the_same(views: list[GridView], model: Calibra
     assert _largest_sigmas(model, _calibrate(finer, (1024, 1024)), scale=2) < 1e-6
 
 
+@pytest.mark.long
 def test_the_numbers_of_the_lattice_do_not_matter(
     views: list[GridView], model: CalibrationModel
 ) -> None:
