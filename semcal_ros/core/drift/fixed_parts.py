@@ -27,6 +27,8 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
+from semcal_ros.core.registration.agreement import keep_bodies
+from semcal_ros.core.registration.fixed_pixels import grow_mask
 
 __all__ = ["LEAST_MOVE_PX", "FixedParts", "find_fixed_parts"]
 
@@ -109,12 +111,11 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
     known = np.isfinite(moved).all(axis=0)
     stays = known & (moved.min(axis=0) > _RATIO * in_place)
     moves = known & (in_place > _RATIO * moved.max(axis=0))
-    stays = _keep_bodies(stays)
+    stays = keep_bodies(stays, _LEAST_PIXELS)
     if float(np.mean(stays)) > _MOST_STAYS:
         return None
-    side = 2 * _ENLARGED_PX + 1
-    enlarged = cv2.dilate(stays.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-    return FixedParts(np.asarray(enlarged), np.asarray(moves & ~enlarged))
+    enlarged = grow_mask(stays, _ENLARGED_PX)
+    return FixedParts(enlarged, np.asarray(moves & ~enlarged))
 
 
 def _to_levels(image: AnyImage) -> Image:
@@ -126,11 +127,3 @@ def _sum_squares(difference: Image) -> Image:
     size = (_SQUARE_PX, _SQUARE_PX)
     found = cv2.boxFilter(difference**2, cv2.CV_32F, size, normalize=True)
     return np.asarray(found + np.float32(_ROUNDING))
-
-
-def _keep_bodies(found: Mask) -> Mask:
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(
-        found.astype(np.uint8), connectivity=8
-    )
-    large = np.flatnonzero(statistics[:, cv2.CC_STAT_AREA] >= _LEAST_PIXELS)
-    return np.asarray(found & np.isin(labels, large))

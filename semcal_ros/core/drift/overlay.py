@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.registration.fixed_pixels import grow_mask
 
 __all__ = ["find_overlay", "remove_overlay"]
 
@@ -74,8 +75,7 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
             core |= drawn & (line >= _LEAST_LINE)
     if np.count_nonzero(core) < _LEAST_PIXELS:
         return None
-    side = 2 * _ENLARGED_PX + 1
-    return np.asarray(cv2.dilate(core.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+    return grow_mask(core, _ENLARGED_PX)
 
 
 def remove_overlay(image: AnyImage, overlay: Mask) -> AnyImage:

@@ -36,7 +36,14 @@ from semcal_ros.core.registration.inverse_compositional import TileStatistics
 from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
 from semcal_ros.core.registration.tiles import band_of
 
-__all__ = ["Agreement", "MovingTiles", "TileNoise", "find_agreement", "information_weights"]
+__all__ = [
+    "Agreement",
+    "MovingTiles",
+    "TileNoise",
+    "find_agreement",
+    "information_weights",
+    "keep_bodies",
+]
 
 # What of the structure of a tile may be missing, or be there besides, as a part of it: contrast changes with charging,
 # focus and contamination by some tenths over a field.
@@ -128,7 +135,7 @@ class Agreement:
     def is_complete(self) -> bool:
         """Whether all of the image agrees: no body does not, not even where the ground has no structure."""
         most = self.share > _ALL_AGREES and self.pull < 1.0 - _ALL_AGREES
-        return most and not np.any(_keep_bodies(self.disagrees, _BODY_TILES))
+        return most and not np.any(keep_bodies(self.disagrees, _BODY_TILES))
 
     @property
     def are_bodies(self) -> bool:
@@ -185,14 +192,14 @@ def find_agreement(tiles: TileStatistics, noise: TileNoise) -> Agreement:
     # By area: a bright tool has more of a gradient than all of the ground.
     share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
-    body = _fill(_keep_bodies(disagrees, _BODY_TILES))
+    body = _fill(keep_bodies(disagrees, _BODY_TILES))
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * np.trace(tiles.gradient, axis1=-2, axis2=-1)
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
     return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights)
 
 
-def _keep_bodies(disagrees: Mask, least: int) -> Mask:
+def keep_bodies(disagrees: Mask, least: int) -> Mask:
     """The tiles that lie together in bodies of at least so many; one alone is chance, or a particle that blinks."""
     found = disagrees.astype(np.uint8)
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
@@ -312,7 +319,7 @@ class MovingTiles:
     @classmethod
     def of(cls, disagrees: Mask, corner_px: Array, side_px: Array) -> MovingTiles:
         """From the tiles that disagree: a body has no holes, and is more than one tile."""
-        filled = _fill(_keep_bodies(disagrees, _LEAST_TILES))
+        filled = _fill(keep_bodies(disagrees, _LEAST_TILES))
         return cls(filled, corner_px, side_px, float(filled.mean()))
 
     @classmethod

@@ -47,7 +47,7 @@ def grow_mask(mask: Mask, by_px: int) -> Mask:
 
 
 def drop_fixed_pixels(
-    reference: Reference, fixed: Mask | None, region: Region, shift_px: Array
+    reference: Reference, fixed: Mask | None, region: Region | None, shift_px: Array
 ) -> Reference:
     """A reference without its own fixed pixels, and without those that an image shows at a shift.
 
@@ -58,7 +58,7 @@ def drop_fixed_pixels(
     fixed
         (h, w) True at the pixels of the image that do not show the specimen; None where all do.
     region
-        The part of the image that is compared.
+        The part of the image that is compared; None for all of it.
     shift_px
         (2,) by how much further right and down the image shows what the reference shows, in px of the whole images.
 
@@ -78,9 +78,9 @@ def drop_fixed_pixels(
     if reference.fixed is not None:
         dropped |= grow_mask(reference.fixed, reach)
     if fixed is not None:
-        left, top, right, bottom = region
+        left, top, right, bottom = region or (0, 0, fixed.shape[1], fixed.shape[0])
         around = grow_mask(fixed[top:bottom, left:right], reach + _MOVED_PX)
-        origin = np.subtract(region[:2], reference.region[:2])
+        origin = np.subtract((left, top), reference.region[:2])
         # Where the reference shows what the image shows at its corner.
         x, y = (int(v) for v in np.rint(origin - np.asarray(shift_px)))
         across, down = (

@@ -416,10 +416,9 @@ def register(
     InvalidValueError
         If the shape or type is not that of an image, or the region does not lie in it.
     """
-    _, inside = _crop(image, image_region)
     dropped_at = np.asarray(guess_px, dtype=np.float64)
     for _ in range(_MOST_DROPPED):
-        part = drop_fixed_pixels(reference, fixed, inside, dropped_at)
+        part = drop_fixed_pixels(reference, fixed, image_region, dropped_at)
         found = _register(
             part,
             image,
