@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""sensor_msgs/msg/CameraInfo of rectified images (design section 9)."""
+"""sensor_msgs/msg/CameraInfo of rectified images: see ``doc/model.md``, "Square pixels"."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@
 
 With display width D of the calibration and field width W, the magnification is ``g = D / W``. A
 pixel size p over an image of n pixels means ``W = n p``; a magnification g' that refers to another
-display width D' means ``W = D' / g'`` (design section 3).
+display width D' means ``W = D' / g'``. Why a magnification alone says little: ``doc/conventions.md``.
 """
 
 from __future__ import annotations

@@ -14,9 +14,8 @@
 
 """Projection of sem-frame points to raw pixels, with derivatives, for arrays of camera parameters.
 
-The model is that of design section 4, equations (9)-(12) of Malti et al. (2012),
-doi:10.1117/1.JEI.21.3.033020, rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho``
-so that nothing diverges at ``rho = 0``:
+The model is that of ``doc/model.md``: equations (9)-(12) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020,
+rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho`` so that nothing diverges at ``rho = 0``:
 
     w   = 1 + rho Z
     x_u = px + m (a X + sigma Y) / w

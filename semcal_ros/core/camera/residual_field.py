@@ -15,7 +15,7 @@
 """Residual field: the distortion that the terms of lens and scan cannot describe.
 
 What they leave is a smooth displacement of the image. It is held by a
-tensor-product B-spline over the raw pixel and log g (design section 4): a raw pixel x would lie at
+tensor-product B-spline over the raw pixel and log g (``doc/model.md``, "Residual field"): a raw pixel x would lie at
 
     x + n G((x - c) / n, g)
 

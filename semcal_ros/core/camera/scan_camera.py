@@ -72,7 +72,7 @@ def as_points(values: ArrayLike, dimensions: int) -> Array:
 
 @dataclass(frozen=True)
 class ScanCamera:
-    """Projection and distortion of the SEM at one magnification (design section 4).
+    """Projection and distortion of the SEM at one magnification: ``doc/model.md``.
 
     It knows three kinds of pixels of one image: *raw* ones, as scanned; *ideal* ones, without
     distortion; *rectified* ones, which are ideal, square and at right angles, as in ``image_rect``.

@@ -20,10 +20,10 @@ pass ``k`` is acquired at
 
     t = t0 + k T + row T / rows + (col / width) (T / rows) (1 - f)
 
-(design section 7). A frame averaged from several passes shows the mean over the passes. Where each line is scanned
-n times before the next one, its time ``T / rows`` is that of n lines, and the pixel shows their mean.
-A recursive average ``y_k = y_(k-1) + (x_k - y_(k-1)) / N`` of passes x shows what was N - 1 passes ago
-on average.
+as ``doc/drift_and_rectification.md``, "Raster timing", says. A frame averaged from several passes shows the mean over
+the passes. Where each line is scanned n times before the next one, its time ``T / rows`` is that of n lines, and the
+pixel shows their mean. A recursive average ``y_k = y_(k-1) + (x_k - y_(k-1)) / N`` of passes x shows what was N - 1
+passes ago on average.
 """
 
 from __future__ import annotations
