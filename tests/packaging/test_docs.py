@@ -114,6 +114,16 @@ def test_docstrings_cite_pages_and_headings_that_exist() -> None:
     assert missing == []
 
 
+def test_the_page_of_flows_names_modules_that_exist() -> None:
+    """With or without their folders, as `live_drift.py` or `nodes/frames/live_drift.py`."""
+    text = (ROOT / "doc" / "how_it_runs.md").read_text(encoding="utf-8")
+    paths = [p.as_posix() for p in (ROOT / "semcal_ros").rglob("*.py")]
+    paths += [p.as_posix() for p in (ROOT / "tests").rglob("*.py")]
+    named = set(re.findall(r"[\w/]+\.py\b", text))
+    assert len(named) > 50
+    assert {name for name in named if not any(p.endswith(f"/{name}") for p in paths)} == set()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_named_commands_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
