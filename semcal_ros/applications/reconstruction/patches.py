@@ -31,8 +31,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from semcal_ros.applications.reconstruction.appearance import Shading, fit_shading
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, project_to_plane
-from semcal_ros.applications.reconstruction.shading import Shading, fit_shading
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
