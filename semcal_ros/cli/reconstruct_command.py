@@ -165,7 +165,7 @@ def command(
         done.save_cloud(cloud, unit=unit)
     if figure is not None:
         # Imported here, so that a run without a figure does not wait for matplotlib.
-        from semcal_ros.report.ball_figures import write_ball_figure
+        from semcal_ros.report.reconstruction_figures import write_ball_figure
 
         with show_progress("drawing"):
             write_ball_figure(done.structure, done.ball, figure)
@@ -215,7 +215,7 @@ def _measure_relief(
         done.save(cloud, unit=unit)
     if figure is not None:
         # Imported here, so that a run without a figure does not wait for matplotlib.
-        from semcal_ros.report.relief_figures import write_relief_figure
+        from semcal_ros.report.reconstruction_figures import write_relief_figure
 
         with show_progress("drawing"):
             write_relief_figure(done.heights, figure)
