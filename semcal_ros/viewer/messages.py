@@ -25,8 +25,13 @@ from typing import Any
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.images.scale_bar import choose_scale_bar, format_length
 from semcal_ros.files.images.write import pixel_scale
-from semcal_ros.viewer.lengths import digits_of, format_with_sigma
-from semcal_ros.viewer.measure import PICTURES, Distance, measure_distance
+from semcal_ros.viewer.measure import (
+    PICTURES,
+    Distance,
+    digits_of,
+    format_with_sigma,
+    measure_distance,
+)
 from semcal_ros.viewer.pictures import (
     Contrast,
     Levels,

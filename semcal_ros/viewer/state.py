@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.viewer.lengths import format_with_sigma
+from semcal_ros.viewer.measure import format_with_sigma
 from semcal_ros.viewer.source import DriftPanel, Magnification
 
 __all__ = ["DriftTrace", "describe_magnification", "drift_in_pixels"]
