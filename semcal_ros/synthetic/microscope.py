@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The virtual microscope: a camera for every magnification, with its scan timing."""
+"""The virtual microscope: a camera for every magnification, with its scan timing and its operating conditions."""
 
 from __future__ import annotations
 
@@ -28,8 +28,13 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.laws import Constant, Law
 
-__all__ = ["Residual", "VirtualMicroscope"]
-
+__all__ = [
+    "SIMULATED_VOLTAGE_V",
+    "SIMULATED_WORKING_DISTANCE_M",
+    "Residual",
+    "VirtualMicroscope",
+    "conditions_of",
+]
 
 # A fixed-point step multiplies the error by the residual's derivative: from 10 px, 60 steps reach
 # the tolerance for derivatives up to 0.65.
@@ -37,6 +42,8 @@ _FIXED_POINT_STEPS = 60
 # A hundred times below the 1e-8 px of the splines that render with it, and above the rounding of a
 # coordinate of 4096 px (9e-13).
 _FIXED_POINT_TOLERANCE_PX = 1e-10
+#: Ordinary values, which are told only: no image depends on them.
+SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M = 10e3, 10e-3
 
 
 @dataclass(frozen=True)
@@ -244,3 +251,33 @@ class VirtualMicroscope:
 
 def _check_magnification(magnification: float) -> float:
     return check_positive(magnification, "magnification")
+
+
+def conditions_of(
+    microscope: VirtualMicroscope,
+    *,
+    voltage_v: float = SIMULATED_VOLTAGE_V,
+    working_distance_m: float = SIMULATED_WORKING_DISTANCE_M,
+    scan_rotation_rad: float = 0.0,
+) -> dict[str, float | str]:
+    """Return the conditions as the topic ``conditions`` names them, in SI units.
+
+    Parameters
+    ----------
+    microscope
+        With its image size and timing.
+    voltage_v, working_distance_m, scan_rotation_rad
+        What it is set to.
+    """
+    timing = microscope.timing
+    line_share = (1.0 - timing.flyback_fraction) / timing.line_averages
+    return {
+        "accelerating_voltage_v": voltage_v,
+        "working_distance_m": working_distance_m,
+        "scan_rotation_rad": scan_rotation_rad,
+        "frame_time_s": timing.frame_time_s,
+        "dwell_s": timing.frame_time_s * line_share / (microscope.width * microscope.height),
+        "detector": "simulated",
+        "maker": "semcal_ros",
+        "model": microscope.name,
+    }
