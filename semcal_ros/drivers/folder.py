@@ -37,7 +37,7 @@ from semcal_ros.drivers.file_settings import file_conditions, file_stage
 from semcal_ros.drivers.journal import FileState, Journal
 from semcal_ros.drivers.source import SourceFrame
 from semcal_ros.files.images.image_file import ImagePage, describe_image_file, is_image_file
-from semcal_ros.files.images.video_frames import VIDEO_SUFFIXES
+from semcal_ros.files.video import VIDEO_SUFFIXES
 
 __all__ = ["FolderSource"]
 
