@@ -39,6 +39,8 @@ WITH_THRESHOLDS = ("core/", "applications/")
 WITH_TYPES = ("core/calibration", "core/drift")
 LONGEST = 5
 MANY = 10
+# Methods of a table of thresholds (semcal_ros/core/thresholds.py), by the kind of source.
+KINDS = ("derived", "measured", "defined", "cost", "stated")
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 
 
@@ -67,10 +69,10 @@ class Report:
     """``count path:line name`` of the functions with the most parameters."""
 
 
-def read_modules(root: Path) -> list[Module]:
-    """Read all files of the package below a root."""
+def read_modules(root: Path, room: str = "") -> list[Module]:
+    """Read all files of the package below a root, or of one room, such as ``core/corners``."""
     found = []
-    for path in sorted((root / PACKAGE).rglob("*.py")):
+    for path in sorted((root / PACKAGE / room).rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         name = ".".join(path.relative_to(root).with_suffix("").parts)
         relative = path.relative_to(root / PACKAGE).as_posix()
@@ -174,12 +176,11 @@ def find_constants(module: Module) -> list[tuple[str, int, str]]:
 
 
 def _kind_of_row(value: ast.expr | None) -> str | None:
-    """``stated`` of ``threshold("NAME", 3.0, "px", Source.STATED, "...")``; None for any other expression."""
-    if isinstance(value, ast.Call) and ast.unparse(value.func).endswith("threshold"):
-        for argument in value.args:
-            if isinstance(argument, ast.Attribute) and ast.unparse(argument.value) == "Source":
-                return argument.attr.lower()
-    return None
+    """``stated`` of ``TABLE.stated("NAME", 3.0, "px", "why")``; None for any other expression."""
+    if not (isinstance(value, ast.Call) and isinstance(value.func, ast.Attribute)):
+        return None
+    table, kind = ast.unparse(value.func.value), value.func.attr
+    return kind if table == "TABLE" and kind in KINDS else None
 
 
 def _is_number(value: ast.expr | None) -> bool:
@@ -231,8 +232,8 @@ def _is_dataclass(node: ast.AST) -> bool:
     )
 
 
-def read_commit(commit: str) -> list[Module]:
-    """Read the modules of a commit.
+def read_commit(commit: str, room: str = "") -> list[Module]:
+    """Read the modules of a commit, or of one room.
 
     Raises
     ------
@@ -245,7 +246,7 @@ def read_commit(commit: str) -> list[Module]:
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
             archive.extractall(folder, filter="data")
-        return read_modules(Path(folder))
+        return read_modules(Path(folder), room)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -24,11 +24,26 @@ from scipy import ndimage
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Array32, Indices, Mask
 from semcal_ros.core.corners.corner_fit import CornerFit, PositionFit
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+from semcal_ros.core.corners.thresholds import (
+    ANGLE_MAX,
+    BLUR_SIGMAS,
+    BORDER_UNLIKE,
+    CHI2_EXCESS,
+    CHI2_MAX,
+    CHI2_SIGMAS,
+    CONTINUED_MAX,
+    CONTRAST_MIN,
+    COVERAGE_MIN,
+    IMBALANCE_MAX,
+    LEVERAGE_MAX,
+    MARGIN_PX,
+    MISFIT_VISIBLE,
+    PART_MIN,
+    UNLIKE_MAX,
+)
 from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = [
-    "CORNERS_MIN",
-    "MARGIN_PX",
     "FittedCorners",
     "contrast_signs",
     "find_credible",
@@ -36,15 +51,6 @@ __all__ = [
     "inflate_variance",
     "select_connected",
 ]
-
-
-# Parts of another board are off by up to 0.3 squares, the search radius of a growing lattice; local
-# maps predict the next corners across a gap to a few hundredths of a square.
-CONTINUED = 0.05
-# Predictions with a larger variance than this reach too far across the gap.
-LEVERAGE_MAX = 25.0
-# Smaller parts were predicted from the corners across the gap already, and agree with them.
-PART_MIN = 4
 
 
 def select_connected(cells: Indices, maps: LocalMaps, fit: PositionFit, keep: Mask) -> Mask:
@@ -87,46 +93,8 @@ def _continues(
     spacing = np.linalg.norm(cell_maps.axes[other][near], axis=2).min(axis=1)
     variance = 0.5 * np.trace(fit.covariance[other][near], axis1=1, axis2=2)
     miss = np.linalg.norm(xy[other][near] - maps.xy[near], axis=1)
-    allowed = CONTINUED * spacing + 3.0 * np.sqrt(variance * (1.0 + maps.leverage[near]))
+    allowed = CONTINUED_MAX * spacing + 3.0 * np.sqrt(variance * (1.0 + maps.leverage[near]))
     return bool(np.median(miss / allowed) < 1.0)
-
-
-# Corners nearer to the frame than this are not fitted: up to half of their window is outside the
-# image.
-MARGIN_PX = 2.0
-# Least contrast relative to the median of the image. Saddle points are kept down to about the same
-# part of the contrast of the strong ones.
-CONTRAST_MIN = 0.3
-# Least part of the window in the image. A corner on one side of the frame keeps half of its window
-# and is fitted; one in a corner of the frame keeps a quarter and is not.
-COVERAGE_MIN = 0.3
-# Largest angle between a fitted edge and the local map, rad: more than six standard deviations of
-# its prior.
-ANGLE_MAX = 0.2
-# Residuals of more than twice the usual size (four times the median chi-square) do not belong to a
-# corner.
-CHI2_MAX = 4.0
-# A corner counts as disturbed where its chi-square exceeds the median by this part, which allows
-# for differences between good corners and was chosen by trial,
-CHI2_EXCESS = 0.5
-# and by this number of standard deviations of chi-square per degree of freedom, sqrt(2 / freedom).
-CHI2_SIGMAS = 6.0
-# RMS residual, in parts of half the contrast, below which a misfit is not visible and a corner is
-# kept whatever its chi-square. Chosen by trial.
-MISFIT_MAX = 0.12
-# Undisturbed corners exceed this score, a chi-square with two degrees of freedom, once in 2000.
-IMBALANCE_MAX = 15.0
-# Stains of the board and shortcomings of the model, relative to half the contrast.
-UNLIKE_MAX = 0.05
-# Beyond the border of a board all squares are alike; at a corner of the board the fourth square
-# differs from them by one, in units of ``CornerFit.unlike``.
-BORDER = 0.5
-# Noise alone exceeds four sigmas once in 15000 corners, but the spread is that of all corners and
-# its tails are longer than a normal distribution's.
-BLUR_SIGMAS = 4.0
-# A quadratic map has six coefficients per coordinate and a linear one half of that: fewer corners
-# cannot be compared with each other.
-CORNERS_MIN = 6
 
 
 @dataclass(frozen=True)
@@ -184,7 +152,7 @@ def find_credible(cells: Indices, maps: LocalMaps, fit: CornerFit, image: Array3
     if not np.any(judged):
         return np.zeros(len(cells), dtype=np.bool_)
     usual = CHI2_MAX * float(np.median(fit.chi2[judged]))
-    small = fit.variance.mean(axis=1) < (MISFIT_MAX * fit.contrast) ** 2
+    small = fit.variance.mean(axis=1) < (MISFIT_VISIBLE * fit.contrast) ** 2
     return judged & ((fit.chi2 < usual) | small)
 
 
@@ -201,13 +169,13 @@ def find_undisturbed(fitted: FittedCorners) -> Mask:
     """
     fit = fitted.fit
     # Half of the corners of a small board may lie on its border, and would set the median.
-    good = fitted.good & (fit.unlike < BORDER)
+    good = fitted.good & (fit.unlike < BORDER_UNLIKE)
     if not np.any(good):
         return good
     pooled = float(np.median(fit.chi2[good]))
     significant = fit.chi2 > pooled * (1.0 + CHI2_EXCESS + CHI2_SIGMAS * np.sqrt(2.0 / fit.freedom))
     surplus = fit.variance.mean(axis=1) * np.maximum(1.0 - pooled / fit.chi2, 0.0)
-    visible = surplus > (MISFIT_MAX * fit.contrast) ** 2
+    visible = surplus > (MISFIT_VISIBLE * fit.contrast) ** 2
     return good & ~(significant & visible) & _alike(fit, good, pooled)
 
 

@@ -37,6 +37,15 @@ from semcal_ros.core.corners.edge_model import (
     evaluate,
 )
 from semcal_ros.core.corners.priors import Prior
+from semcal_ros.core.corners.thresholds import (
+    ASSUMED_VARIANCE,
+    BAND_BLURS,
+    BAND_MIN_PX,
+    BLUR_MIN_PX,
+    FIT_BLOCK_PIXELS,
+    NOISE_FLOOR_PART,
+    PULL_LEAST,
+)
 from semcal_ros.core.corners.window import PixelWindows
 
 if TYPE_CHECKING:
@@ -55,25 +64,6 @@ __all__ = [
     "split_statistics",
 ]
 
-# A pixel averages over its own width, which alone is a blur of 1 / sqrt(12) = 0.289 px: no edge is
-# sharper.
-BLUR_MIN_PX = 0.28
-# Least half-width of the band along an edge, which leaves room for an error of the prediction.
-BAND_MIN_PX = 3.0
-# Half-width of the band in blur widths: at three of them the slope of an edge is 1 % of its peak.
-BAND_BLURS = 3.0
-# The line of the noise model falls below zero for dark pixels; this part of the floor keeps their
-# weights within a factor of four of those at the mean of the dark pixels. A safeguard, not a
-# measurement.
-LEAST_OF_FLOOR = 0.25
-# Large enough to hide the cost of a call, small enough to keep the arrays in the cache.
-BLOCK_PIXELS = 24000
-# Part of the prior's variance: where pixels carry almost no information, rounding must not decide
-# whether a pull is large.
-PULL_LEAST = 0.02
-# Variance of a pixel in the first pass, before the noise is known.
-ASSUMED_VARIANCE = 0.02
-
 
 @dataclass(frozen=True)
 class NoiseModel:
@@ -91,7 +81,7 @@ class NoiseModel:
         """Return the variance at the grey values ``value``, in the same shape."""
         variance = np.float32(self.slope) * (value - np.float32(self.dark))
         variance += np.float32(self.floor)
-        least = np.float32(LEAST_OF_FLOOR * self.floor)
+        least = np.float32(NOISE_FLOOR_PART * self.floor)
         return np.asarray(np.maximum(variance, least), dtype=np.float32)
 
 
@@ -236,7 +226,7 @@ def fit_corners(
     judged
         Whether to compare opposite squares.
     """
-    block = max(1, BLOCK_PIXELS // windows.x.shape[1])
+    block = max(1, FIT_BLOCK_PIXELS // windows.x.shape[1])
     parts = []
     for first in range(0, max(1, len(windows.origin)), block):
         rows = slice(first, first + block)

@@ -56,55 +56,32 @@ from semcal_ros.core.corners.pattern import (
     describe_odds,
 )
 from semcal_ros.core.corners.saddle import LatticeStatus, prepare_image, screen_image
+from semcal_ros.core.corners.thresholds import (
+    ALONG_SIGMA,
+    CELL_ASYMMETRY_MAX,
+    CELL_FULL_PX,
+    CELL_MISFIT_MAX,
+    CHESS_MISFIT_MAX,
+    CLEAR_MISFIT,
+    COMMON_POWER_MIN,
+    CONVINCING_PART,
+    COVERED_RATIO,
+    FILLED_PART,
+    FOREIGN_MAX,
+    GROWN_MIN,
+    LATTICES_TRIED,
+    MINIMUM_CORNERS,
+    SAME_AREA_LOG,
+    SCALE_MAX_PART,
+    SCALES_PX,
+    SMALL_PART,
+    SPACING_MIN_PX,
+    UNEVEN_MAX,
+)
 from semcal_ros.core.errors import Rejection
 
 __all__ = ["MINIMUM_CORNERS", "LatticeDetection", "LatticeStatus", "find_lattice"]
 
-
-# Scales of the search for saddle points, px, in steps of 1.7. A quarter of the distance between saddle points is
-# best. The first suits the small squares of low magnifications; the largest one is bounded by the picture.
-_SCALES_PX = (2.5, 1.5, 4.2, 7.0, 12.0, 20.0, 34.0, 58.0, 99.0, 168.0, 286.0, 486.0)
-_LARGEST_SCALE_PART = 0.075
-# A view with fewer corners is refused: twice as many as determine a homography, so that there are residuals to judge
-# it by.
-MINIMUM_CORNERS = 8
-# Points of a lattice that is looked at closely: less would be a seed and its neighbours.
-_LEAST_GROWN = 6
-# How much more of the picture a less likely pattern has to cover than a likelier one of the same lattice to be taken
-# for it. Chosen, not measured.
-_MORE = 1.5
-# A lattice whose regular squares cover this part of the image will not be surpassed at another scale.
-_FILLED = 0.6
-# Part of the expected points that pass beyond which no coarser picture shows more of them.
-_CONVINCING = 0.8
-# If a larger part of the corners does not continue the lattice, that part is a second board rather
-# than cut off by debris.
-_FOREIGN_MAX = 0.15
-# Part of the power of a unit cell that no shape explains, above which it is no grid: cells of a lattice through noise
-# have 0.6 and more. Photographs leave 0.006, bright rims an eighth of the pitch wide up to 0.2, and a textured cross
-# grating 0.23.
-_MISFIT_MAX = 0.4
-# Of a chess board nothing but growth and blur changes the cell; photographs leave up to 0.004.
-_CHESS_MISFIT_MAX = 0.08
-# A hexagonal lattice of dots has 0.05 or more, and a square one with a blur of a sixth of the pitch, seen
-# at 45 degrees, has 0.001.
-_ASYMMETRY_MAX = 0.02
-# Below this a grown lattice, whose points are good to a few tenths of a pixel, shows its pattern; with
-# blurred or wrongly grown cells the fitted corners decide.
-_CLEAR_MISFIT = 0.02
-# A lattice that covers less of the image than this must show its pattern clearly: texture repeats itself by chance.
-_SMALL = 0.15
-# Square dots a half of their distance wide also make a lattice of dots and gaps, whose cells differ: what
-# is common to them has two thirds of the power or less. Lattices of different scales through the same
-# dots differ by a tenth.
-_POWER_MIN = 0.8
-# Lattices of different scales that are looked at closely.
-_LATTICES_TRIED = 4
-# Largest distance between dots that is fitted at full resolution, px: the time grows with its square, and edges that
-# are sharper than a pixel of the reduced picture lose a tenth of their certainty at most.
-_CELL_FULL_PX = 80.0
-# Least distance of points in a reduced picture, px.
-_SPACING_MIN_PX = 10.0
 
 _POINTS = {
     "chess": "corners",
@@ -113,14 +90,6 @@ _POINTS = {
     "lines": "crossings",
     "grating": "places on lines",
 }
-# Logarithm of the ratio of two areas that are the same: tilts and distortions change them by less over a picture, and
-# lattices of which one has every other point of the other differ by 0.69.
-_SAME_AREA = 0.3
-# 1-sigma along the lines of a grating, in sides of the picture: a million places tell lengths along them to 10 %.
-_ALONG = 30.0
-# Departure of the lines of a grating from even distances, in these: rough edges and noise as large as the contrast make
-# it 0.013, and three lines of a circuit 0.06.
-_UNEVEN = 0.04
 
 
 def _no_covariance() -> Array:
@@ -239,7 +208,7 @@ def find_lattice(
             answer = answer or own
         elif own is not None and (best is None or _filled_by(own) > _filled_by(best)):
             best, is_clear = own, candidate.is_clear
-        if best is not None and candidate.filled > 0.5 * _FILLED:
+        if best is not None and candidate.filled > 0.5 * FILLED_PART:
             break
     if best is not None and (is_clear or crossed is not None):
         return best
@@ -272,7 +241,7 @@ def _measure_likely(
         if isinstance(found, Rejection):
             answer = answer or found
         # What is less likely must cover clearly more.
-        elif best is None or _filled_by(found) > _MORE * _filled_by(best):
+        elif best is None or _filled_by(found) > COVERED_RATIO * _filled_by(best):
             best = found
     return best or answer
 
@@ -280,7 +249,7 @@ def _measure_likely(
 def _find_crossed(pyramid: _Pyramid) -> _Candidate | None:
     """Return the cells of a pattern that repeats in two directions, by its frequencies."""
     places = find_cells(pyramid.level, pyramid.size)
-    if places is None or len(places.ij) < _LEAST_GROWN:
+    if places is None or len(places.ij) < GROWN_MIN:
         return None
     cells = centre_cells(pyramid.level, places)
     shapes = fit_lattice_shapes(pyramid.level, cells)
@@ -301,8 +270,8 @@ def _may_be(candidate: _Candidate, crossed: _Candidate) -> bool:
         float(np.median(np.abs(np.linalg.det(cells.axes))))
         for cells in (candidate.cells, crossed.corners)
     )
-    are_parts = crossed.shapes.power < _POWER_MIN * candidate.shapes.power
-    return are_parts or abs(np.log(own / other)) < _SAME_AREA
+    are_parts = crossed.shapes.power < COMMON_POWER_MIN * candidate.shapes.power
+    return are_parts or abs(np.log(own / other)) < SAME_AREA_LOG
 
 
 def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStatus]:
@@ -323,7 +292,7 @@ def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStat
         )
     fit = fit_lines(found.ij, found.xy)
     along = fit.along
-    if fit.scatter_px > _UNEVEN * found.spacing_px:
+    if fit.scatter_px > UNEVEN_MAX * found.spacing_px:
         return Rejection(
             LatticeStatus.NO_LATTICE,
             f"no grating: lines that depart from even distances by {fit.scatter_px:.2g} px, 1-sigma, which are "
@@ -333,7 +302,7 @@ def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStat
     variance = np.einsum("ni,nij,nj->n", across, found.covariance_px2, across)
     scatter = estimate_scatter_px(found.ij, found.xy, found.covariance_px2, dimensions=1)
     variance = variance + scatter**2
-    far = np.full(len(along), (_ALONG * max(found.image_size)) ** 2)
+    far = np.full(len(along), (ALONG_SIGMA * max(found.image_size)) ** 2)
     # Places are numbered from anywhere along the lines. One of them counts as known, so that the numbers have a place.
     middle = 0.5 * (np.array(found.image_size) - 1.0)
     nearest = int(np.argmin(np.sum((found.xy - middle) ** 2, axis=1)))
@@ -394,7 +363,7 @@ class _Candidate:
     @property
     def is_clear(self) -> bool:
         """Whether it shows its pattern."""
-        return self.shapes is not None and self.shapes.best.misfit < _CLEAR_MISFIT
+        return self.shapes is not None and self.shapes.best.misfit < CLEAR_MISFIT
 
     @property
     def is_likely_chess(self) -> bool:
@@ -405,12 +374,12 @@ class _Candidate:
 def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
     """Find lattices scale by scale; a clear chess board that fills the image ends the search."""
     image, size = pyramid.image, pyramid.size
-    for scale in _SCALES_PX:
-        if scale > _LARGEST_SCALE_PART * min(size) and scale > _SCALES_PX[0]:
+    for scale in SCALES_PX:
+        if scale > SCALE_MAX_PART * min(size) and scale > SCALES_PX[0]:
             continue
-        octave = max(0, int(np.log2(scale / _SCALES_PX[0])))
+        octave = max(0, int(np.log2(scale / SCALES_PX[0])))
         corners = grow_at_scale(pyramid.level(octave), scale, octave, size)
-        if corners is None or len(corners.ij) < _LEAST_GROWN:
+        if corners is None or len(corners.ij) < GROWN_MIN:
             continue
         bright = bright_cells(image, corners)
         cells = None if bright is None else split_mixture(pyramid.level, bright)
@@ -421,23 +390,23 @@ def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
         candidate = _Candidate(corners, cells, shapes, filled, regular, cells is not bright)
         yield candidate
         is_chess = shapes is not None and shapes.allows("chess") and not candidate.is_mixture
-        if candidate.regular > _FILLED and candidate.is_clear and is_chess:
+        if candidate.regular > FILLED_PART and candidate.is_clear and is_chess:
             return
 
 
 def _rank(found: list[_Candidate]) -> list[_Candidate]:
     """Return the most regular candidates first, without those whose cells are mixtures of different ones."""
-    tried = [c for c in found if c.shapes is None or c.shapes.best.misfit < _MISFIT_MAX]
+    tried = [c for c in found if c.shapes is None or c.shapes.best.misfit < CELL_MISFIT_MAX]
     largest = max((c.regular for c in tried), default=0.0)
     near = [c.shapes.power for c in tried if c.shapes is not None and c.regular > 0.5 * largest]
     strongest = max(near, default=0.0)
     kept = [
         c
         for c in tried
-        if (c.is_clear or c.filled > _SMALL)
-        and (c.shapes is None or c.shapes.power >= _POWER_MIN * strongest)
+        if (c.is_clear or c.filled > SMALL_PART)
+        and (c.shapes is None or c.shapes.power >= COMMON_POWER_MIN * strongest)
     ]
-    return sorted(kept, key=lambda c: c.regular, reverse=True)[:_LATTICES_TRIED]
+    return sorted(kept, key=lambda c: c.regular, reverse=True)[:LATTICES_TRIED]
 
 
 def _likely_shapes(
@@ -450,7 +419,7 @@ def _likely_shapes(
         return [CellShape("chess", True, 1.0, 0.0, 0.0)] if wanted in ("auto", "chess") else []
     # Of a chess board, the corners are elsewhere than the cells of a mixture.
     may_be_chess = shapes.allows("chess") and not candidate.is_mixture
-    if shapes.asymmetry > _ASYMMETRY_MAX and not may_be_chess:
+    if shapes.asymmetry > CELL_ASYMMETRY_MAX and not may_be_chess:
         return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
     if wanted == "auto":
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
@@ -480,15 +449,13 @@ def _measure(
     if shape.pattern != "chess" and candidate.cells is not None:
         spacing = np.linalg.norm(candidate.cells.axes, axis=2)
     typical = float(np.median(spacing))
-    first = (
-        0 if shape.pattern == "chess" else max(0, int(np.ceil(np.log2(typical / _CELL_FULL_PX))))
-    )
-    last = max(first, int(np.log2(typical / _SPACING_MIN_PX)))
+    first = 0 if shape.pattern == "chess" else max(0, int(np.ceil(np.log2(typical / CELL_FULL_PX))))
+    last = max(first, int(np.log2(typical / SPACING_MIN_PX)))
     for octave in range(first, last + 1):
         points = _refine(pyramid.level(octave), candidate, shape, octave)
         if points is not None and (best is None or _passed(points) > _passed(best)):
             best = points
-        if best is not None and best.quality > _CONVINCING:
+        if best is not None and best.quality > CONVINCING_PART:
             break
     if best is None:
         return Rejection(
@@ -542,7 +509,7 @@ def _judge_chess(
             LatticeStatus.OTHER_PATTERN,
             f"{PATTERN_NAMES[shapes.best.pattern]}, but not well enough in view",
         )
-    if shapes.chess.misfit > _CHESS_MISFIT_MAX:
+    if shapes.chess.misfit > CHESS_MISFIT_MAX:
         return Rejection(LatticeStatus.NO_LATTICE, "no grid: a regular pattern, but not of squares")
     return replace(judged, odds=shapes.odds_of("chess"))
 
@@ -563,13 +530,13 @@ def _judge(
             f"no grid: only {round(100 * points.quality)} % of the expected {what}"
             f" look like {what}",
         )
-    if points.foreign > max(_FOREIGN_MAX * len(points.ij), _LEAST_GROWN):
+    if points.foreign > max(FOREIGN_MAX * len(points.ij), GROWN_MIN):
         return Rejection(
             LatticeStatus.TWO_BOARDS,
             f"two boards: {points.foreign} {what} do not continue the lattice of the other"
             f" {len(points.ij)}",
         )
-    if len(points.ij) < MINIMUM_CORNERS and candidate.filled < 0.5 * _FILLED:
+    if len(points.ij) < MINIMUM_CORNERS and candidate.filled < 0.5 * FILLED_PART:
         return Rejection(
             LatticeStatus.NO_LATTICE,
             f"no grid: only {len(points.ij)} regular {what}, in"

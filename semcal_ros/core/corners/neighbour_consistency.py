@@ -19,29 +19,26 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2, MEDIAN_CHI2_2, Array, Indices, Mask
-from semcal_ros.core.corners.checks import CORNERS_MIN, inflate_variance
+from semcal_ros.core.corners.checks import inflate_variance
 from semcal_ros.core.corners.corner_fit import PositionFit
-from semcal_ros.core.corners.local_map import SUPPORT_MIN, LocalMaps, fit_local_maps
-from semcal_ros.core.corners.priors import LARGE_SQUARE_PX
+from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+from semcal_ros.core.corners.thresholds import (
+    CORNERS_COMPARED_MIN,
+    LARGE_SQUARE_PX,
+    MAP_ERROR_PX,
+    MAP_ERROR_RATIO,
+    RESIDUAL_SIGMAS,
+    SCATTER_SIGMAS,
+    SUPPORT_MIN,
+    TREND_DEGREE,
+)
 
 __all__ = ["estimate_scatter_px", "find_consistent"]
 
 
-# Noise alone exceeds the last of these once in 900 corners; debris shifts far more of them.
-MISS_SIGMAS = (5.0, 4.3, 3.7)
-# Error of local maps through squares of LARGE_SQUARE_PX under the strongest distortion, per
-# standard deviation of the prediction of a corner; it grows as the third power of the square.
-MAP_ERROR_PX = 2.0
-# That error is concentrated in parts of the image, where it is this many times its median.
-MAP_ERROR_RATIO = 4.0
-# Scatter beyond that of chance: once in 400 images of a regular grid with independent errors.
-SCATTER_SIGMAS = 2.8
 # Relative 1-sigma of the median of n chi-squares by their degrees of freedom, times sqrt(n): half the inverse of the
 # density at the median, over the median.
 MEDIAN_SIGMA = {1: 2.333, 2: 1.0 / np.log(2.0)}
-# A trend of this degree follows smooth distortions and perspectives to a few hundredths of a pixel.
-# Twice as many corners as terms keep single corners from bending it.
-TREND_DEGREE = 5
 
 
 def find_consistent(cells: Indices, maps: LocalMaps, fit: PositionFit, good: Mask) -> Mask:
@@ -50,8 +47,8 @@ def find_consistent(cells: Indices, maps: LocalMaps, fit: PositionFit, good: Mas
     Later passes leave out the worst corners, which spoil the predictions of their neighbours.
     """
     chosen = good
-    for sigmas in MISS_SIGMAS:
-        if chosen.sum() < CORNERS_MIN:
+    for sigmas in RESIDUAL_SIGMAS:
+        if chosen.sum() < CORNERS_COMPARED_MIN:
             return np.zeros(len(good), dtype=np.bool_)
         chosen = good & _agree_with_neighbours(cells, maps, fit, chosen, sigmas)
     return chosen
@@ -116,7 +113,7 @@ def _score_lens(xy: Array, flat: Array, covariance: Array) -> float:
     ]
     design = np.array(columns).reshape(len(columns), -1).T
     freedom = design.shape[0] - design.shape[1]
-    if freedom < CORNERS_MIN:
+    if freedom < CORNERS_COMPARED_MIN:
         return np.inf
     target = flat.T.ravel()
     rest = (target - design @ np.linalg.lstsq(design, target, rcond=None)[0]).reshape(2, -1).T
@@ -129,7 +126,7 @@ def _score_neighbours(cells: Indices, flat: Array, covariance: Array) -> float:
     rest = flat - _trend(cells, np.ones(len(cells), dtype=np.bool_), flat)
     maps = fit_local_maps(cells, cells, rest)
     told = maps.support >= SUPPORT_MIN
-    if told.sum() < CORNERS_MIN:
+    if told.sum() < CORNERS_COMPARED_MIN:
         return np.inf
     miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
     return float(np.median(_squared_mahalanobis(miss, covariance)[told]))

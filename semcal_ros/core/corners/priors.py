@@ -37,36 +37,25 @@ from semcal_ros.core.corners.edge_model import (
     EdgeGeometry,
 )
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
+from semcal_ros.core.corners.thresholds import (
+    ANGLE_PRIOR,
+    GRADIENT_LEAST,
+    GRADIENT_PRIOR,
+    GROWTH_PRIOR_PX,
+    LARGE_SQUARE_PX,
+    LIKELIHOOD_LOSS,
+    LOG_BLUR_PRIOR,
+    OUTLIER_SCORE,
+    SAGITTA_PRIOR_PX,
+)
 
-__all__ = ["LARGE_SQUARE_PX", "Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
+__all__ = ["Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
 
 
 PARAMETERS = NONLINEAR + LINEAR
-# Direction of an edge about that of the local map, rad. Saddle points are good to a few tenths of a
-# pixel, which over one square of 10 px is about this.
-ANGLE_PRIOR = 0.03
-# Logarithm of the blur: a factor of 1.6 about the first guess.
-LOG_BLUR_PRIOR = 0.5
-# Error of a quadratic or cubic map through few, one-sided neighbours under a strong distortion; it
-# grows as the third power of the square.
-SAGITTA_PRIOR_PX = 0.5
-# Side of the squares for which that holds: about a quarter of a 512 px image.
-LARGE_SQUARE_PX = 130.0
-# Shading over half a square, relative to the contrast of the image.
-GRADIENT_PRIOR = 0.15
-# Least deviation of a gradient that the neighbours predict: just below the step of an 8-bit image,
-# 1 / 255 of its range.
-GRADIENT_LEAST = 0.003
-# Growth of the bright squares times contrast, px.
-GROWTH_PRIOR = 0.3
 # Spreads that are tried, relative to the loose ones above; those above 1 only where the corners show
 # more than the loose ones allow.
 SPREADS: Array = np.concatenate([np.geomspace(0.02, 1.0, 14), np.geomspace(1.35, 11.0, 8)])
-# Loss of log-likelihood against the best spread up to which a larger one is taken: one standard
-# deviation.
-LIKELIHOOD_LOSS = 0.5
-# Squared score at which an outlier's weight ends: three standard deviations.
-OUTLIER = 9.0
 # Parameters that share one spread.
 GROUPS = (ANGLES, slice(LOG_BLUR, LOG_BLUR + 1), SAGITTAS, *GRADIENTS, GROWTH)
 # Parameters with a value that is common to all corners of an image.
@@ -126,7 +115,7 @@ def loose_prior(maps: LocalMaps, geometry: EdgeGeometry, blur_px: float) -> Prio
     deviation[:, SAGITTAS] = sagitta[:, None]
     for gradient in GRADIENTS:
         deviation[:, gradient] = GRADIENT_PRIOR
-    deviation[:, GROWTH] = GROWTH_PRIOR
+    deviation[:, GROWTH] = GROWTH_PRIOR_PX
     mean = np.zeros_like(deviation)
     mean[:, ANGLES] = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
     mean[:, LOG_BLUR] = np.log(blur_px)
@@ -181,7 +170,7 @@ def _largest_spread(score: Array, variance: Array) -> float:
     """Return the largest spread that scores with these variances do not contradict."""
     total = SPREADS[:, None] ** 2 + variance
     # Corners under debris count no more than others at three standard deviations.
-    cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER)).sum(axis=1)
+    cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER_SCORE)).sum(axis=1)
     plausible = cost <= cost.min() + LIKELIHOOD_LOSS
     if SPREADS[np.argmin(cost)] <= 1.0:
         plausible &= SPREADS <= 1.0
