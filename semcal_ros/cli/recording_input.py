@@ -216,8 +216,10 @@ def _reading(command: Command, *, several: bool, required: bool = True) -> Comma
         ]
         if display_width is not None:
             microscope = replace(microscope, display_width_m=display_width)
-        own = {"recordings": given} if several else {"recording": given[0] if given else None}
-        return command(config=microscope, **own, **others)
+        recordings = (
+            {"recordings": given} if several else {"recording": given[0] if given else None}
+        )
+        return command(config=microscope, **recordings, **others)
 
     name = "RECORDINGS..." if several else "RECORDING" if required else "[RECORDING]"
     decorated: Any = read

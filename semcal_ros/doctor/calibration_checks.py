@@ -136,8 +136,8 @@ def _size(seen: CalibrationSeen, size: tuple[int, int] | None) -> list[Finding]:
 
 def _display(seen: CalibrationSeen, config: MicroscopeConfig) -> list[Finding]:
     source = config.magnification
-    own = source.quantity != "magnification" or source.display_width_m is not None
-    if own or abs(config.display_width_m / seen.display_width_m - 1.0) < 1e-6:
+    is_independent = source.quantity != "magnification" or source.display_width_m is not None
+    if is_independent or abs(config.display_width_m / seen.display_width_m - 1.0) < 1e-6:
         return []
     return [
         note(

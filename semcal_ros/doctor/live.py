@@ -254,14 +254,14 @@ class _Observer:
     # -- graph -------------------------------------------------------------------------------------
 
     def _graph(self) -> Graph:
-        own = self._node.get_fully_qualified_name()
+        this_node = self._node.get_fully_qualified_name()
         names = [
             f"{namespace.rstrip('/')}/{name}"
             for name, namespace in self._node.get_node_names_and_namespaces()
         ]
         known = [name for name, _ in self._node.get_topic_names_and_types()]
         return Graph(
-            nodes=tuple(sorted(name for name in names if name != own)),
+            nodes=tuple(sorted(name for name in names if name != this_node)),
             publishers={name: self._publishers(name) for name in known},
             subscriptions={
                 name: self._endpoints(self._node.get_subscriptions_info_by_topic(name))
@@ -273,7 +273,7 @@ class _Observer:
         return self._endpoints(self._node.get_publishers_info_by_topic(topic))
 
     def _endpoints(self, infos: Iterable[Any]) -> tuple[Endpoint, ...]:
-        own = self._node.get_fully_qualified_name()
+        this_node = self._node.get_fully_qualified_name()
         found = [
             Endpoint(
                 f"{info.node_namespace.rstrip('/')}/{info.node_name}",
@@ -283,7 +283,7 @@ class _Observer:
             )
             for info in infos
         ]
-        return tuple(end for end in found if end.node != own)
+        return tuple(end for end in found if end.node != this_node)
 
     def _ask(self, nodes: tuple[str, ...]) -> dict[str, Any]:
         """Ask for the values of :data:`_PARAMETERS` by node; None for nodes that do not answer."""

@@ -194,9 +194,9 @@ def _with_readings(
             session = replace(session, stage=position)
         except SemcalError as error:
             session = replace(session, stage_trouble=str(error))
-    told = next((messages.get(t.name) for t in topics if t.what == CONDITIONS), None)
-    if told is not None:
+    message = next((messages.get(t.name) for t in topics if t.what == CONDITIONS), None)
+    if message is not None:
         # A recording may redefine the type: then nothing is known.
         with suppress(MessageError):
-            session = replace(session, conditions=read_conditions(told))
+            session = replace(session, conditions=read_conditions(message))
     return session

@@ -166,13 +166,13 @@ def plot_poses(agreed: Repeatability) -> Figure:
     count = len(agreed.magnifications)
     for row, g in enumerate(agreed.magnifications):
         color, mark = _COLORS[row % len(_COLORS)], _MARKS[row % len(_MARKS)]
-        beside = pose + 0.12 * (row - 0.5 * (count - 1))
+        position = pose + 0.12 * (row - 0.5 * (count - 1))
         for axes, values in (
             (upper, agreed.deflection_m[row]),
             (lower, agreed.deflection_m[row] - mean),
         ):
             axes.errorbar(
-                beside,
+                position,
                 1e9 * values,
                 yerr=1.96e9 * agreed.sigma_m[row],
                 fmt=mark,
@@ -211,8 +211,8 @@ def plot_strip(
     firsts
         First frame of each pose.
     """
-    bent = [abs(series[0].frames[k].deflection_m) for k in firsts]
-    most = int(np.nanargmax(bent)) if np.isfinite(bent).any() else 0
+    deflections_m = [abs(series[0].frames[k].deflection_m) for k in firsts]
+    most = int(np.nanargmax(deflections_m)) if np.isfinite(deflections_m).any() else 0
     poses = sorted({0, most, len(firsts) - 1})[:_SHOWN_POSES]
     figure = create_figure(2.1 * len(poses), 2.2 * len(series))
     grid = figure.subplots(len(series), len(poses), squeeze=False)

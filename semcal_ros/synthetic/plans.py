@@ -262,7 +262,7 @@ def calibration_plan(
                 if index > 0 or len(poses) == 1:
                     tilt = stage.tilted_rad[tilted % len(stage.tilted_rad)]
                     tilted += 1
-                own, position = pose_on_stage(
+                placed, position = pose_on_stage(
                     stage,
                     tilt,
                     float(rng.uniform(-math.pi, math.pi)),
@@ -271,7 +271,7 @@ def calibration_plan(
                 )
                 frame = replace(
                     frame,
-                    pose=own,
+                    pose=placed,
                     position=position,
                     position_read=read_position(stage, position, rng),
                 )

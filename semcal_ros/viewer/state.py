@@ -52,18 +52,20 @@ def describe_magnification(
     text = f"{magnification:.6g}×"
     if calibration is None:
         return Magnification(text, "unknown", "not calibrated")
-    told = _span(calibration.magnification_range)
+    calibrated = _span(calibration.magnification_range)
     origin = calibration.origin_of(magnification)
     if origin == "extrapolated":
-        return Magnification(text, "outside", f"outside the calibration, {told}")
+        return Magnification(text, "outside", f"outside the calibration, {calibrated}")
     if calibration.ladder is None:
-        return Magnification(text, "ok", f"calibrated, {told}")
+        return Magnification(text, "ok", f"calibrated, {calibrated}")
     if calibration.method == "specimen":
-        return Magnification(text, "ok", f"calibrated by a specimen, {told}")
+        return Magnification(text, "ok", f"calibrated by a specimen, {calibrated}")
     grid = _span(calibration.ladder.anchored)
     if origin == "grid":
-        return Magnification(text, "ok", f"calibrated by a grid, {grid}; by a specimen, {told}")
-    return Magnification(text, "ok", f"calibrated by a specimen, {told}; by a grid, {grid}")
+        return Magnification(
+            text, "ok", f"calibrated by a grid, {grid}; by a specimen, {calibrated}"
+        )
+    return Magnification(text, "ok", f"calibrated by a specimen, {calibrated}; by a grid, {grid}")
 
 
 def _span(ends: tuple[float, float]) -> str:

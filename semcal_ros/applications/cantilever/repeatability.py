@@ -187,8 +187,8 @@ def _average_poses(
             noise = np.array([f.noise_m for f in chosen])
             share = 1.0 / (len(parts[0]) + 1.0)
             common = float(weight @ (sigmas**2 - noise**2)) + share * float(weight @ noise**2)
-            own = (1.0 - share) * float(np.sum(weight**2 * noise**2))
-            sigma[row, column] = float(np.sqrt(max(common + own, 0.0)))
+            independent = (1.0 - share) * float(np.sum(weight**2 * noise**2))
+            sigma[row, column] = float(np.sqrt(max(common + independent, 0.0)))
     return value, sigma
 
 

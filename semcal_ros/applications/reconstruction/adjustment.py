@@ -357,8 +357,8 @@ def _finish(
     through = through - through.mean(axis=1, keepdims=True)
     spread = (poses @ through.reshape(len(free), -1)).reshape(through.shape)
     count = len(state.points)
-    own = (1.0 - 2.0 / count) * inverse + inverse.sum(axis=0) / count**2
-    covariance = (own + np.einsum("api,apj->pij", through, spread, optimize=True)) * unit_m**2
+    of_points = (1.0 - 2.0 / count) * inverse + inverse.sum(axis=0) / count**2
+    covariance = (of_points + np.einsum("api,apj->pij", through, spread, optimize=True)) * unit_m**2
     full = np.zeros((6 * problem.views, 6 * problem.views))
     full[np.ix_(free, free)] = poses
     by_view = full.reshape(problem.views, 6, problem.views, 6)

@@ -162,8 +162,8 @@ def measure_ball(
 
 def _compute_excess(structure: Structure, sphere: SphereFit) -> float:
     """Compute the part of the squared residuals that the points' own uncertainty does not explain."""
-    own = np.mean(structure.normal_sigma_m[sphere.inliers] ** 2)
-    return float(np.clip(1.0 - own / sphere.rms_m**2, 0.0, 1.0))
+    expected = np.mean(structure.normal_sigma_m[sphere.inliers] ** 2)
+    return float(np.clip(1.0 - expected / sphere.rms_m**2, 0.0, 1.0))
 
 
 def _count_sharing(structure: Structure) -> float:

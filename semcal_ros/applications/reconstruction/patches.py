@@ -347,8 +347,8 @@ def match_points(patches: Image, seen: Mask, half: int) -> tuple[Array, Array, A
         fitted = error + shift[at, point] @ slope.T
         variance = np.sum(window * fitted**2, axis=1) / window.sum()
         covariance[at, point] = variance[:, None, None] * inverse
-        own = np.sum(window * stack**2, axis=1)
-        correlation[at, point] = both / np.sqrt(power * own)
+        power_seen = np.sum(window * stack**2, axis=1)
+        correlation[at, point] = both / np.sqrt(power * power_seen)
     return shift, covariance, correlation
 
 

@@ -94,7 +94,7 @@ class DisturbanceObserver:
         self.velocity_m_s: Array = np.zeros(2)
         self.variance: Array = np.full(2, sigma_m_s**2)
 
-    def update(self, interval_s: float, beside_m: Array, variance_m2: Array) -> None:
+    def update(self, interval_s: float, unexplained_m: Array, variance_m2: Array) -> None:
         """Update the filter with motion in an interval that the commands do not explain.
 
         An innovation far beyond expectation is a knock on the stage and not drift, unless it
@@ -110,7 +110,7 @@ class DisturbanceObserver:
         if interval_s <= 0.0:
             return
         self.variance = self.variance + self._change**2 * interval_s
-        surprise = beside_m / interval_s - self.velocity_m_s
+        surprise = unexplained_m / interval_s - self.velocity_m_s
         spread = self.variance + variance_m2 / interval_s**2 + 1e-30
         if np.any(surprise**2 > _GATE**2 * spread):
             self._odd += 1

@@ -179,10 +179,10 @@ def compare_conditions(
         if not values or value is None:
             continue
         if _differs(name, values, value, height_sigma_m):
-            own = describe_condition(name, (value,))[1]
+            value_text = describe_condition(name, (value,))[1]
             found.append(
                 ConditionDifference(
-                    name, own, describe_condition(name, values)[1], name in _DECISIVE
+                    name, value_text, describe_condition(name, values)[1], name in _DECISIVE
                 )
             )
     return tuple(found)
@@ -195,27 +195,27 @@ def _differs(
         texts = {known.strip().casefold() for known in values if isinstance(known, str)}
         if not isinstance(value, str) or len(texts) < len(values):
             return False
-        own = value.strip().casefold()
-        if name == "maker" and _NO_MAKER in (own, *texts):
+        word = value.strip().casefold()
+        if name == "maker" and _NO_MAKER in (word, *texts):
             return False
-        return bool(own) and own not in texts
+        return bool(word) and word not in texts
     numbers = [float(known) for known in values]
-    low, high, own_value = min(numbers), max(numbers), float(value)
-    if not all(map(math.isfinite, (low, high, own_value))):
+    low, high, number = min(numbers), max(numbers), float(value)
+    if not all(map(math.isfinite, (low, high, number))):
         return False
     if name == "scan_rotation_rad":
         # The whole turn that brings it next to the middle of the range.
         middle = 0.5 * (low + high)
-        own_value = middle + math.remainder(own_value - middle, 2.0 * math.pi)
-        return not low - _ROTATION_TOLERANCE_RAD <= own_value <= high + _ROTATION_TOLERANCE_RAD
+        number = middle + math.remainder(number - middle, 2.0 * math.pi)
+        return not low - _ROTATION_TOLERANCE_RAD <= number <= high + _ROTATION_TOLERANCE_RAD
     relative = {
         "acceleration_voltage_v": _VOLTAGE_TOLERANCE,
         "working_distance_m": _DISTANCE_TOLERANCE,
     }.get(name, _OTHER_TOLERANCE)
     if name == "acceleration_voltage_v":
         # Some programs show the negative voltage of the cathode.
-        low, high, own_value = (*sorted((abs(low), abs(high))), abs(own_value))
+        low, high, number = (*sorted((abs(low), abs(high))), abs(number))
     least = height_sigma_m if name == "working_distance_m" else 0.0
-    return own_value < low - max(relative * abs(low), least) or own_value > high + max(
+    return number < low - max(relative * abs(low), least) or number > high + max(
         relative * abs(high), least
     )

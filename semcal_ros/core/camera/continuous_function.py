@@ -233,8 +233,8 @@ class ContinuousFunction:
         if len(self.extension):
             # Downwards, everything is mirrored.
             sign = 1.0 if self.extension[-1] > self.extension[0] else -1.0
-            bent = _extension_row(sign * float(np.log(g)), sign * np.log(self.extension))
-            row = np.concatenate([row, bent])
+            extension = _extension_row(sign * float(np.log(g)), sign * np.log(self.extension))
+            row = np.concatenate([row, extension])
         if len(self.breaks) == 0:
             return row
         return np.concatenate([row, (g >= self.breaks).astype(np.float64)])

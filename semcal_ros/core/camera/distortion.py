@@ -173,15 +173,19 @@ def undistort_normalised(
     while active.size and iterations < _MAX_ITERATIONS:
         iterations += 1
         f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s, xi_u)
-        miss = q_d[active] - f
+        residual = q_d[active] - f
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.
         good = np.isfinite(determinant) & (determinant > 0.0)
-        step = np.empty_like(miss)
+        step = np.empty_like(residual)
         safe = np.where(good, determinant, np.nan)
-        step[:, 0] = (jacobian[:, 1, 1] * miss[:, 0] - jacobian[:, 0, 1] * miss[:, 1]) / safe
-        step[:, 1] = (jacobian[:, 0, 0] * miss[:, 1] - jacobian[:, 1, 0] * miss[:, 0]) / safe
-        error[active] = np.hypot(miss[:, 0], miss[:, 1])
+        step[:, 0] = (
+            jacobian[:, 1, 1] * residual[:, 0] - jacobian[:, 0, 1] * residual[:, 1]
+        ) / safe
+        step[:, 1] = (
+            jacobian[:, 0, 0] * residual[:, 1] - jacobian[:, 1, 0] * residual[:, 0]
+        ) / safe
+        error[active] = np.hypot(residual[:, 0], residual[:, 1])
         q[active] = q[active] + step
         size = np.hypot(step[:, 0], step[:, 1])
         reached = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))

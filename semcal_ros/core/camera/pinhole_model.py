@@ -152,12 +152,12 @@ def fit_pinhole(camera: ScanCamera, coefficients: int = 5) -> PinholeModel:
 
     def derivative(unknowns: Array) -> Array:
         made = build(unknowns)
-        own = cv2.projectPoints(
+        jacobian = cv2.projectPoints(
             points[:, None], made.rotation, made.translation_m, made.matrix, made.distortion
         )[1]
         # OpenCV: rotation, translation, focal lengths, principal point, distortion.
         columns = [6, 7, 8, 9, *range(10, 10 + coefficients), 0, 1, 2, 3, 4]
-        return np.concatenate([own[:, columns] * units, np.diag(ties)])
+        return np.concatenate([jacobian[:, columns] * units, np.diag(ties)])
 
     if _is_pinhole(camera):
         start[2:4] = camera.px, camera.py

@@ -152,10 +152,10 @@ def project_points_with_jacobians(
     up, tilt = rho * inverse_w, z * inverse_w
     for row in (0, 1):
         by_x, by_y, by_xi = df_dq[:, row, 0], df_dq[:, row, 1], norm_px * df_dxi[:, row].T
-        own = 1.0
+        per_stretch = 1.0
         if scan is not None:
-            own = 1.0 / scan.stretch[row]
-            by_x, by_y, by_xi = own * by_x, own * by_y, own * by_xi
+            per_stretch = 1.0 / scan.stretch[row]
+            by_x, by_y, by_xi = per_stretch * by_x, per_stretch * by_y, per_stretch * by_xi
         along = by_x * scaled_u + by_y * scaled_v
         d_xyz[row, 0] = by_x * scale * a
         d_xyz[row, 1] = scale * (by_x * skew + by_y / a)
@@ -169,11 +169,11 @@ def project_points_with_jacobians(
         d_parameters[row, 6:8] = by_xi[:2]
         d_parameters[row, 8] = -by_x
         d_parameters[row, 9] = -by_y
-        d_parameters[row, 8 + row] += own
+        d_parameters[row, 8 + row] += per_stretch
         if scan is not None:
             d_parameters[row, 10:12] = by_xi[2:]
             functions = slice(0, ALONG_COUNT) if row == 0 else slice(ALONG_COUNT, None)
-            d_parameters[row, 12:][functions] = -own * scan.basis[functions]
+            d_parameters[row, 12:][functions] = -per_stretch * scan.basis[functions]
     return ProjectionJacobians(
         xy,
         np.moveaxis(d_xyz, -1, 0),

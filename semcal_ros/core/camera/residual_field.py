@@ -216,8 +216,8 @@ class FieldSlice:
             if not active.size:
                 return q
             here = q[active]
-            miss = here + self.displacement(here) - target[active]
-            step = np.linalg.solve(np.eye(2) + self.gradient(here), miss[:, :, None])[:, :, 0]
+            residual = here + self.displacement(here) - target[active]
+            step = np.linalg.solve(np.eye(2) + self.gradient(here), residual[:, :, None])[:, :, 0]
             q[active] = here - step
             active = active[np.max(np.abs(step), axis=1) > _TOLERANCE]
         q[active] = np.nan

@@ -452,7 +452,7 @@ class ScanCamera:
         ex, ey = self.rect_from_ideal([[self.ex, self.ey]])[0].tolist()
         covariance = self.covariance
         if covariance is not None:
-            covariance = _congruent(self._rectified_from_own, covariance)
+            covariance = _congruent(self._rectified_from_parameters, covariance)
         return RectifiedCamera(
             magnification=self.magnification,
             m=self.m,
@@ -474,7 +474,7 @@ class ScanCamera:
         )
 
     @property
-    def _rectified_from_own(self) -> Array:
+    def _rectified_from_parameters(self) -> Array:
         """(P, P) from errors of the parameters to those of the parameters of :attr:`rectified`.
 
         The rectification is done with the parameters as they are estimated, so an error dM of the
@@ -670,7 +670,9 @@ class RectifiedCamera(ScanCamera):
         covariance = self.source.joint_covariance
         if covariance is None:
             return None
-        return _congruent(_extend(self.source._rectified_from_own, len(covariance)), covariance)
+        return _congruent(
+            _extend(self.source._rectified_from_parameters, len(covariance)), covariance
+        )
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
         """Return the derivative (n, 2, P + F) of the rectified pixel of a point.
@@ -685,8 +687,8 @@ class RectifiedCamera(ScanCamera):
         by = by * source._stretch(xy)[:, :, None]
         lens = distort_jacobians(q, *source._lens)[1]
         by = source._rect_from_ideal @ np.linalg.solve(lens, by)
-        own = by @ np.linalg.inv(_extend(source._rectified_from_own, by.shape[2]))
-        return _scatter_rows(own, known, len(points))
+        by_rectified = by @ np.linalg.inv(_extend(source._rectified_from_parameters, by.shape[2]))
+        return _scatter_rows(by_rectified, known, len(points))
 
 
 def _congruent(matrix: Array, covariance: Array) -> Array:

@@ -182,18 +182,18 @@ def _scale(raster: Raster, axis: int) -> float:
 
 def _amplitudes(amplitudes: Array, axis: int) -> Array:
     """Return those of an axis, (k, 1) or (k, n)."""
-    own = amplitudes[..., :ALONG_COUNT] if axis == 0 else amplitudes[..., ALONG_COUNT:]
-    return np.moveaxis(np.atleast_2d(own), -1, 0)
+    of_axis = amplitudes[..., :ALONG_COUNT] if axis == 0 else amplitudes[..., ALONG_COUNT:]
+    return np.moveaxis(np.atleast_2d(of_axis), -1, 0)
 
 
 def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (13,) or (n, 13)."""
     out = np.zeros_like(xy)
     for axis in (0, 1):
-        own = _amplitudes(amplitudes, axis)
-        if np.any(own):
+        of_axis = _amplitudes(amplitudes, axis)
+        if np.any(of_axis):
             u = (xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis)
-            out[:, axis] = raster.norm_px * _make_curve(own).value(u)[0]
+            out[:, axis] = raster.norm_px * _make_curve(of_axis).value(u)[0]
     return out
 
 
@@ -212,15 +212,15 @@ def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) ->
     """
     raw = deflection.copy()
     for axis in (0, 1):
-        own = _amplitudes(amplitudes, axis)
-        if np.any(own):
-            raw[:, axis] = _invert(deflection[:, axis], own, raster, axis)
+        of_axis = _amplitudes(amplitudes, axis)
+        if np.any(of_axis):
+            raw[:, axis] = _invert(deflection[:, axis], of_axis, raster, axis)
     return raw
 
 
-def _invert(target: Array, own: Array, raster: Raster, axis: int) -> Array:
+def _invert(target: Array, of_axis: Array, raster: Raster, axis: int) -> Array:
     scale = _scale(raster, axis)
-    curve = _make_curve(own)
+    curve = _make_curve(of_axis)
     # In half pictures of this axis.
     goal, part = (target - raster.middle_px[axis]) / scale, raster.norm_px / scale
     u = goal - part * curve.value(goal)[0]
@@ -268,22 +268,22 @@ class _Curve:
         return value + slope * (u - inside), slope
 
 
-def _make_curve(own: Array) -> _Curve:
+def _make_curve(of_axis: Array) -> _Curve:
     """Return the sum of the functions of an axis with amplitudes (k, 1), or with some for each point, (k, n)."""
-    return _kept_curve(own.tobytes()) if own.shape[1] == 1 else _sum_functions(own)
+    return _kept_curve(of_axis.tobytes()) if of_axis.shape[1] == 1 else _sum_functions(of_axis)
 
 
 @lru_cache(maxsize=64)
-def _kept_curve(own: bytes) -> _Curve:
+def _kept_curve(of_axis: bytes) -> _Curve:
     # A live camera asks for the same ones several times a frame.
-    return _sum_functions(np.frombuffer(own)[:, None])
+    return _sum_functions(np.frombuffer(of_axis)[:, None])
 
 
-def _sum_functions(own: Array) -> _Curve:
+def _sum_functions(of_axis: Array) -> _Curve:
     polynomials = len(_POWERS)
-    powers = np.tensordot(_POWERS, own[:polynomials], axes=(0, 0))
+    powers = np.tensordot(_POWERS, of_axis[:polynomials], axes=(0, 0))
     decays = []
-    for amplitude, line, rate in zip(own[polynomials:], _LINES, _RATES, strict=False):
+    for amplitude, line, rate in zip(of_axis[polynomials:], _LINES, _RATES, strict=False):
         if np.any(amplitude):
             powers[0] -= amplitude * line[0]
             powers[1] -= amplitude * line[1]

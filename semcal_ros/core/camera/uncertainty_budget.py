@@ -122,10 +122,10 @@ def _scale_parts(
             expected=f"one below the pivot of the scan at {-1e3 / camera.rho:.3g} mm",
         )
     rectified, sigma = camera.rectified, model.scale_sigma
-    own = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]
+    total = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]
     extra = float(np.hypot(sigma.relative(camera.rho), model.ladder_sigma(magnification)))
     beyond = model.extrapolation_sigma(magnification)
-    views = max(own**2 - extra**2 - beyond**2, 0.0)
+    views = max(total**2 - extra**2 - beyond**2, 0.0)
     steps = 0.0
     if (ladder := model.ladder) is not None and ladder.beyond(magnification) > 0.0:
         # What is not known at the end of the grid goes with every step; the rest comes from the steps.
@@ -254,7 +254,7 @@ def _distortion(camera: RectifiedCamera, length_px: float) -> float:
     for axis, full in ((0, camera.width), (1, camera.height)):
         step = np.zeros(2)
         step[axis] = 0.5 * min(length_px, full - 1.0)
-        own = camera.pixel_size_sigma_m[axis] / camera.pixel_size_m[axis]
+        relative = camera.pixel_size_sigma_m[axis] / camera.pixel_size_m[axis]
         for x in _PLACES:
             for y in _PLACES:
                 middle = np.array([x * camera.width, y * camera.height])
@@ -266,5 +266,5 @@ def _distortion(camera: RectifiedCamera, length_px: float) -> float:
                 row = (jacobian[1] - jacobian[0]) / (2.0 * step[axis])
                 total = float(row @ covariance @ row)
                 if math.isfinite(total):
-                    worst = max(worst, total - own**2)
+                    worst = max(worst, total - relative**2)
     return math.sqrt(worst)

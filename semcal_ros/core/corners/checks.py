@@ -92,9 +92,9 @@ def _continues(
         return False
     spacing = np.linalg.norm(cell_maps.axes[other][near], axis=2).min(axis=1)
     variance = 0.5 * np.trace(fit.covariance[other][near], axis1=1, axis2=2)
-    miss = np.linalg.norm(xy[other][near] - maps.xy[near], axis=1)
+    residual = np.linalg.norm(xy[other][near] - maps.xy[near], axis=1)
     allowed = CONTINUED_MAX * spacing + 3.0 * np.sqrt(variance * (1.0 + maps.leverage[near]))
-    return bool(np.median(miss / allowed) < 1.0)
+    return bool(np.median(residual / allowed) < 1.0)
 
 
 @dataclass(frozen=True)

@@ -123,9 +123,9 @@ def _clearness_at(spectrum: Spectrum, frequency: Array) -> float:
 def _find_distinct(frequencies: Array, size: Array, most: int) -> list[int]:
     """Return which (n, 2) frequencies are not near one before, or its opposite; at most so many."""
     kept: list[int] = []
-    for k, own in enumerate(frequencies):
+    for k, frequency in enumerate(frequencies):
         others = frequencies[kept]
-        near = np.minimum(_bins(own - others, size), _bins(own + others, size))
+        near = np.minimum(_bins(frequency - others, size), _bins(frequency + others, size))
         if near.min(initial=np.inf) > 2.0 * FREQUENCY_OFF_BINS:
             kept.append(k)
         if len(kept) == most:
@@ -171,10 +171,10 @@ def _reduce(basis: _Basis) -> _Basis:
     """Return the shortest basis of the same frequencies (Gauss)."""
     change = np.eye(2, dtype=np.intp)
     while True:
-        own = change @ basis.frequencies
-        if own[0] @ own[0] > own[1] @ own[1]:
-            change, own = change[::-1], own[::-1]
-        times = int(np.rint(own[0] @ own[1] / (own[0] @ own[0])))
+        shorter = change @ basis.frequencies
+        if shorter[0] @ shorter[0] > shorter[1] @ shorter[1]:
+            change, shorter = change[::-1], shorter[::-1]
+        times = int(np.rint(shorter[0] @ shorter[1] / (shorter[0] @ shorter[0])))
         if times == 0:
             break
         change = np.stack([change[0], change[1] - times * change[0]])

@@ -202,22 +202,22 @@ def find_lattice(
     for candidate in candidates:
         if crossed is not None and not _may_be(candidate, crossed):
             continue
-        own = _measure_likely(pyramid, candidate, wanted)
-        if isinstance(own, Rejection):
+        measured = _measure_likely(pyramid, candidate, wanted)
+        if isinstance(measured, Rejection):
             # What is said is said of the candidate that covers most of the image.
-            answer = answer or own
-        elif own is not None and (best is None or _filled_by(own) > _filled_by(best)):
-            best, is_clear = own, candidate.is_clear
+            answer = answer or measured
+        elif measured is not None and (best is None or _filled_by(measured) > _filled_by(best)):
+            best, is_clear = measured, candidate.is_clear
         if best is not None and candidate.filled > 0.5 * FILLED_PART:
             break
     if best is not None and (is_clear or crossed is not None):
         return best
     # Of a chess board, the corners are elsewhere than its cells.
     if crossed is not None and (wanted not in ("auto", "chess") or not crossed.is_likely_chess):
-        own = _measure_likely(pyramid, crossed, wanted)
-        if isinstance(own, LatticeDetection):
-            return own
-        answer = answer or own
+        measured = _measure_likely(pyramid, crossed, wanted)
+        if isinstance(measured, LatticeDetection):
+            return measured
+        answer = answer or measured
     # Noise between parallel lines makes lattices too.
     if wanted == "auto" and isinstance(find_lines(pyramid.level, pyramid.size), Lattice):
         return Rejection(
@@ -266,12 +266,12 @@ def _may_be(candidate: _Candidate, crossed: _Candidate) -> bool:
     """
     if candidate.cells is None or candidate.shapes is None or crossed.shapes is None:
         return True
-    own, other = (
+    area, other = (
         float(np.median(np.abs(np.linalg.det(cells.axes))))
         for cells in (candidate.cells, crossed.corners)
     )
     are_parts = crossed.shapes.power < COMMON_POWER_MIN * candidate.shapes.power
-    return are_parts or abs(np.log(own / other)) < SAME_AREA_LOG
+    return are_parts or abs(np.log(area / other)) < SAME_AREA_LOG
 
 
 def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStatus]:

@@ -107,11 +107,11 @@ def grow_at_scale(
 def count_regular_area(cells: Lattice) -> float:
     """Return the area, px^2, of the cells that lie where their neighbours predict them."""
     maps = fit_local_maps(cells.ij, cells.ij, cells.xy)
-    miss = np.linalg.norm(maps.xy - cells.xy, axis=1)
+    residual = np.linalg.norm(maps.xy - cells.xy, axis=1)
     spacing = np.linalg.norm(cells.axes, axis=2).min(axis=1)
     # In units of area: a lattice through noise has many small cells.
     area = np.abs(np.linalg.det(cells.axes))
-    return float(area[(miss < 0.1 * spacing) & maps.usable].sum())
+    return float(area[(residual < 0.1 * spacing) & maps.usable].sum())
 
 
 def bright_cells(image: Image, lattice: Lattice) -> Lattice | None:

@@ -115,12 +115,12 @@ def find_lines(
     lattice = _follow(image, wave.multiple * wave.frequency * 2.0 ** (octave - wave.octave))
     if isinstance(lattice, Rejection):
         return lattice
-    own = np.all(lattice.ij % wave.multiple == 0, axis=1)
+    of_period = np.all(lattice.ij % wave.multiple == 0, axis=1)
     factor = 2.0**octave
     return Lattice(
-        lattice.ij[own] // wave.multiple,
-        enlarged(lattice.xy[own], factor),
-        lattice.axes[own] * (factor * wave.multiple),
+        lattice.ij[of_period] // wave.multiple,
+        enlarged(lattice.xy[of_period], factor),
+        lattice.axes[of_period] * (factor * wave.multiple),
     )
 
 
@@ -224,8 +224,8 @@ def _follow(image: Array32, frequency: Array) -> Lattice | Rejection[LatticeStat
     xy = middle + i[:, None] * across + j[:, None] * along
     first = np.round(float(phase.at(middle[None])[0]) / (2.0 * np.pi))
     for _ in range(NEWTON_STEPS):
-        miss = phase.at(xy) - 2.0 * np.pi * (first + i)
-        xy = xy - np.clip(miss / (2.0 * np.pi), -2.0, 2.0)[:, None] * across
+        residual = phase.at(xy) - 2.0 * np.pi * (first + i)
+        xy = xy - np.clip(residual / (2.0 * np.pi), -2.0, 2.0)[:, None] * across
     inside: Mask = np.all((xy >= 0.0) & (xy <= [width - 1, height - 1]), axis=1)
     inside &= np.abs(phase.at(xy) - 2.0 * np.pi * (first + i)) < 0.5
     at = np.rint(xy[inside]).astype(np.intp)

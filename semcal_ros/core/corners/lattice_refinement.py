@@ -222,9 +222,9 @@ def _result(
 def _plausible(lattice: Lattice) -> Lattice:
     """Return the lattice without points that do not fit their neighbours."""
     maps = fit_local_maps(lattice.ij, lattice.ij, lattice.xy)
-    miss = np.linalg.norm(maps.xy - lattice.xy, axis=1)
+    residual = np.linalg.norm(maps.xy - lattice.xy, axis=1)
     spacing = np.linalg.norm(lattice.axes, axis=2).min(axis=1)
-    keep = (miss < 0.3 * spacing) & maps.usable
+    keep = (residual < 0.3 * spacing) & maps.usable
     return lattice.select(keep)
 
 

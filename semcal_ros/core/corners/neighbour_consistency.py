@@ -64,11 +64,11 @@ def _agree_with_neighbours(
     rest = xy - _trend(cells, good, xy)
     maps = fit_local_maps(cells, cells[good], rest[good])
     # The neighbours are as uncertain as the corner itself.
-    miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
+    residual = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
     covariance = fit.covariance * inflate_variance(fit, good)[:, None, None]
-    error = _map_error(cell_maps, good, covariance, _squared_mahalanobis(miss, covariance))
+    error = _map_error(cell_maps, good, covariance, _squared_mahalanobis(residual, covariance))
     covariance = covariance + (error**2)[:, None, None] * np.eye(2)
-    passed = _squared_mahalanobis(miss, covariance) < sigmas**2
+    passed = _squared_mahalanobis(residual, covariance) < sigmas**2
     return passed & (maps.support >= SUPPORT_MIN)
 
 
@@ -125,11 +125,11 @@ def _score_neighbours(cells: Indices, flat: Array, covariance: Array) -> float:
     """Return the median chi-square about predictions of neighbours; infinite without any."""
     rest = flat - _trend(cells, np.ones(len(cells), dtype=np.bool_), flat)
     maps = fit_local_maps(cells, cells, rest)
-    told = maps.support >= SUPPORT_MIN
-    if told.sum() < CORNERS_COMPARED_MIN:
+    supported = maps.support >= SUPPORT_MIN
+    if supported.sum() < CORNERS_COMPARED_MIN:
         return np.inf
-    miss = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
-    return float(np.median(_squared_mahalanobis(miss, covariance)[told]))
+    residual = (rest - maps.xy) / np.sqrt(1.0 + maps.leverage)[:, None]
+    return float(np.median(_squared_mahalanobis(residual, covariance)[supported]))
 
 
 def _score_trend(cells: Indices, flat: Array, covariance: Array, degree: int) -> float:
@@ -142,9 +142,9 @@ def _score_trend(cells: Indices, flat: Array, covariance: Array, degree: int) ->
     return median * count / (count - terms)
 
 
-def _squared_mahalanobis(miss: Array, covariance: Array) -> Array:
+def _squared_mahalanobis(residual: Array, covariance: Array) -> Array:
     """Return (n,) squared lengths of (n, 2) vectors in standard deviations."""
-    x, y = miss.T
+    x, y = residual.T
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 

@@ -144,16 +144,18 @@ def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: flo
         deviation = used.deviation[:, group]
         # The information of the pixels alone, without the prior.
         share = np.maximum(information[:, group] - unit / deviation**2, 1e-9)
-        own = used.mean[:, group] + (parameters[:, group] - used.mean[:, group]) * (
+        likeliest = used.mean[:, group] + (parameters[:, group] - used.mean[:, group]) * (
             information[:, group] / share
         )
         variance = noise / (share * deviation**2)
         if group.start in COMMON:
-            common[group] = _weighted_median(own, 1.0 / (1.0 + variance))
+            common[group] = _weighted_median(likeliest, 1.0 / (1.0 + variance))
             centre = common[group]
         else:
             centre = used.mean[:, group]
-        spread[group] = _largest_spread(((own - centre) / deviation).ravel(), variance.ravel())
+        spread[group] = _largest_spread(
+            ((likeliest - centre) / deviation).ravel(), variance.ravel()
+        )
     return Learnt(common, spread)
 
 
@@ -202,8 +204,8 @@ def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) 
     slope = np.asarray(np.linalg.solve(maps.axes, smooth.axes))
     slope[:, :, 1] *= parity[:, None]
     slope *= 0.25 * np.linalg.norm(maps.axes, axis=2).sum(axis=1)[:, None, None]
-    miss = np.abs(levels - others.xy) / np.sqrt(1.0 + others.leverage)[:, None]
-    typical = np.median(miss[usable], axis=0) / 0.675
+    residual = np.abs(levels - others.xy) / np.sqrt(1.0 + others.leverage)[:, None]
+    typical = np.median(residual[usable], axis=0) / 0.675
     mean, deviation = prior.mean.copy(), prior.deviation.copy()
     for level, gradient in enumerate(GRADIENTS):
         limit = max(float(typical[level]), GRADIENT_LEAST)

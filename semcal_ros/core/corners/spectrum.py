@@ -92,8 +92,8 @@ class Spectrum:
 
     def centre_near(self, frequency: Array) -> Array:
         """Return the centre of the power near a frequency."""
-        own = np.where(self.bins_from(frequency) < WINDOW_LOBE_BINS, self.power, 0.0)
-        return np.array([(own * self.fx).sum(), (own * self.fy).sum()]) / float(own.sum())
+        near = np.where(self.bins_from(frequency) < WINDOW_LOBE_BINS, self.power, 0.0)
+        return np.array([(near * self.fx).sum(), (near * self.fy).sum()]) / float(near.sum())
 
     def find_divisor(self, frequency: Array, lowest: float, highest: float) -> int:
         """Return by what a frequency of the lines is to be divided, so that all of them are its multiples."""
@@ -135,13 +135,15 @@ class Spectrum:
         The power has a maximum there, while that of a hole rises towards lower frequencies, and it comes from
         everywhere in the picture and not from the edge of a hole.
         """
-        own = float(np.linalg.norm(frequency))
-        ratio = np.abs(self.fx * frequency[0] + self.fy * frequency[1]) / own**2
+        length = float(np.linalg.norm(frequency))
+        ratio = np.abs(self.fx * frequency[0] + self.fy * frequency[1]) / length**2
         clearest = float(self.clearness[self.is_peak & (ratio < MULTIPLES_COMPARED)].max())
         among = self.clearness > max(SUBMULTIPLE_POWER, FAINT_PEAK * clearest)
         among &= self.power > SIDE_LOBE_POWER * highest
-        among &= ~self.is_aside(frequency) & (ratio > lowest / own) & (ratio < MULTIPLES_COMPARED)
-        return np.abs(self.find_frequencies(among) @ frequency) / own**2
+        among &= (
+            ~self.is_aside(frequency) & (ratio > lowest / length) & (ratio < MULTIPLES_COMPARED)
+        )
+        return np.abs(self.find_frequencies(among) @ frequency) / length**2
 
     @cached_property
     def is_peak(self) -> Mask:
@@ -167,8 +169,8 @@ class Spectrum:
         c, s = np.cos(turns), np.sin(turns)
         x, y = frequency
         directions = np.stack([c * x - s * y, s * x + c * y], axis=1)
-        own, *others = (self._median_amplitude(f) for f in directions)
-        return own > EVERYWHERE_RATIO * float(np.median(others))
+        amplitude, *others = (self._median_amplitude(f) for f in directions)
+        return amplitude > EVERYWHERE_RATIO * float(np.median(others))
 
     def _median_amplitude(self, frequency: Array) -> float:
         """Return the median amplitude over the places of the image, by the coefficients around the frequency."""

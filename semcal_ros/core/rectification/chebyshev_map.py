@@ -209,19 +209,19 @@ class _TestedMap:
             differ = abs(float(self.raw[middle, axis, 1]) - float(other.raw[middle, axis, 1]))
             if not differ <= nearby * self.size[axis]:
                 return False
-        own, field = self.camera.residual, other.camera.residual
-        assert own is not None
+        field_here, field = self.camera.residual, other.camera.residual
+        assert field_here is not None
         assert field is not None
         # The slices of one field share their knots.
-        if field.knots_y is not own.knots_y or field.knots_x is not own.knots_x:
+        if field.knots_y is not field_here.knots_y or field.knots_x is not field_here.knots_x:
             return False
         nearby_px = np.multiply(_TESTED_NEARBY, self.size)[:, None]
         if not (np.abs(self.raw - other.raw) <= nearby_px).all():
             return False
         added_px = 0.0
-        if field.coefficients is not own.coefficients:
+        if field.coefficients is not field_here.coefficients:
             norm_px = self.camera.norm_px
-            changed = other.camera.norm_px * field.coefficients - norm_px * own.coefficients
+            changed = other.camera.norm_px * field.coefficients - norm_px * field_here.coefficients
             # A spline lies between its coefficients: none of the columns has a larger error.
             left = self._remainders @ changed.reshape(len(changed), -1)
             added_px = _COMPARED_IN_ONE_COLUMN * _largest(left)
@@ -619,8 +619,8 @@ def _measure_error(
         x, y = np.meshgrid(*at)
         xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
         undisplaced = plain.raw_from_rect(moving.moved(xy, raw))
-    miss = camera.without_residual(raw) - undisplaced
-    return float(np.max(np.abs(miss[scanned]), initial=0.0))
+    residual = camera.without_residual(raw) - undisplaced
+    return float(np.max(np.abs(residual[scanned]), initial=0.0))
 
 
 def _find_frame_edges(found: RawMap) -> Indices:

@@ -56,7 +56,7 @@ _LOBES = 4
 # Weight of the estimates before, against that of the next one: some eight of them count.
 _MEMORY = 7.0 / 8.0
 # Frames in which the phase is estimated: the first ones, and then every so many; fewer where nobody declared one.
-_FIRST_LOOKS, _LOOK_EVERY = 8, 8
+_FIRST_ESTIMATES, _ESTIMATE_EVERY = 8, 8
 _FIRST_UNDECLARED, _EVERY_UNDECLARED = 3, 64
 
 
@@ -210,10 +210,12 @@ class LinePhaseCorrector:
         """Return the frame without its line phase, in which :attr:`phase` is the mean of the last estimates."""
         if image.shape != self._size:
             self._size, self._frames, self.phase = image.shape, 0, LinePhase(0.0, np.inf)
-        looks, every = (
-            (_FIRST_LOOKS, _LOOK_EVERY) if self.declared else (_FIRST_UNDECLARED, _EVERY_UNDECLARED)
+        first, every = (
+            (_FIRST_ESTIMATES, _ESTIMATE_EVERY)
+            if self.declared
+            else (_FIRST_UNDECLARED, _EVERY_UNDECLARED)
         )
-        if self._frames < looks or self._frames % every == 0:
+        if self._frames < first or self._frames % every == 0:
             self._add(estimate_line_phase(image))
         self._frames += 1
         if not self.declared or not np.isfinite(self.phase.sigma_px):

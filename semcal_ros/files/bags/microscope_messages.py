@@ -77,13 +77,13 @@ def magnification_message(config: MicroscopeConfig, magnification: float, width_
 
 def stage_message(source: StageConfig, reading: StageReading | None, stamp_ns: int) -> Any:
     """Return the joints of the stage; none where they are not known, which ends the reading before."""
-    own = reading or StageReading()
+    stated = reading or StageReading()
     joints = {
-        source.tilt: own.tilt_rad,
-        source.rotation: own.rotation_rad,
-        source.scan_rotation: own.scan_rotation_rad,
-        source.x: own.x_m,
-        source.y: own.y_m,
+        source.tilt: stated.tilt_rad,
+        source.rotation: stated.rotation_rad,
+        source.scan_rotation: stated.scan_rotation_rad,
+        source.x: stated.x_m,
+        source.y: stated.y_m,
     }
     known = {joint: value for joint, value in joints.items() if value is not None}
     message = blank_message(STAGE_TYPE)

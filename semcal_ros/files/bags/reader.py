@@ -356,9 +356,9 @@ def _find_typestore(connection: Connection, path: Path) -> Typestore:
     known = connection.msgtype in jazzy.fielddefs
     if known and connection.digest and connection.digest == jazzy.hash_rihs01(connection.msgtype):
         return jazzy
-    own = _own_types(connection)
-    _check_arrays(own, f"{connection.msgtype} on {connection.topic} in {path}")
-    if not own:
+    defined = _defined_types(connection)
+    _check_arrays(defined, f"{connection.msgtype} on {connection.topic} in {path}")
+    if not defined:
         if known:
             return jazzy
         raise BagError(
@@ -366,14 +366,16 @@ def _find_typestore(connection: Connection, path: Path) -> Typestore:
             expected="a common ROS 2 type, or its definition inside the recording",
             do="record with mcap, which stores definitions",
         )
-    if all(name in jazzy.fielddefs and jazzy.fielddefs[name][1] == own[name][1] for name in own):
+    if all(
+        name in jazzy.fielddefs and jazzy.fielddefs[name][1] == defined[name][1] for name in defined
+    ):
         return jazzy
     store = get_typestore(Stores.EMPTY)
-    store.register(own)
+    store.register(defined)
     return store
 
 
-def _own_types(connection: Connection) -> dict[str, Any]:
+def _defined_types(connection: Connection) -> dict[str, Any]:
     text = connection.msgdef.data
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         return dict(get_types_from_msg(text, connection.msgtype))

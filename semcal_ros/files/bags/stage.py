@@ -167,8 +167,8 @@ def _find_topic(
 ) -> tuple[BagTopic | None, str]:
     named = [t for t in topics if t.count and topic_matches(source.topic, t.name)]
     fitting = [t for t in named if t.type == source.type]
-    beside = f"{image_topic.rpartition('/')[0]}/{source.topic}"
-    fitting = [t for t in fitting if t.name == beside] or fitting
+    sibling = f"{image_topic.rpartition('/')[0]}/{source.topic}"
+    fitting = [t for t in fitting if t.name == sibling] or fitting
     if len(fitting) == 1:
         return fitting[0], ""
     if fitting:

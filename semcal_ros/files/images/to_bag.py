@@ -158,7 +158,7 @@ def _write_all(
     on_progress: Callable[[int, int], object] | None,
 ) -> tuple[list[dict[str, Any]], list[Skipped]]:
     written, skipped = [], []
-    told: dict[str, float | str] = {}
+    written_conditions: dict[str, float | str] = {}
     stage = config.stage if any(image.stage is not None for image in series.images) else None
     for number, (image, pixels) in enumerate(series.read(), 1):
         if on_progress is not None:
@@ -167,8 +167,8 @@ def _write_all(
             skipped.append(Skipped(image.name, str(pixels)))
             continue
         conditions = image.conditions or Conditions()
-        if conditions.topic_values() != told:
-            told = conditions.topic_values()
+        if conditions.topic_values() != written_conditions:
+            written_conditions = conditions.topic_values()
             before_ns = max(0, image.stamp_ns - _BEFORE_IMAGE_NS)
             topic = microscope_topic(CONDITIONS_TOPIC)
             writer.add_topic(topic, CONDITIONS_TYPE, latched=True, depth=1)

@@ -51,7 +51,7 @@ __all__ = [
     "FrameInput",
     "StreamFrame",
     "StreamNode",
-    "describe_darkness",
+    "describe_blank_image",
     "is_late",
     "nominal_camera",
 ]
@@ -117,7 +117,7 @@ class StreamFrame:
         return self.image.shape[1], self.image.shape[0]
 
 
-def describe_darkness(image: AnyImage) -> str:
+def describe_blank_image(image: AnyImage) -> str:
     """Say that an image shows nothing at all; empty if it shows something.
 
     Parameters
@@ -279,7 +279,7 @@ class FrameInput:
         pixels, encoding = decoded_image(message)
         image = self._without_databar(pixels)
         # The text of a bar is no light: while it is not known whether there is one, the upper half has none.
-        self._look_for_light(pixels[: (len(pixels) + 1) // 2] if image is None else image)
+        self._check_for_contrast(pixels[: (len(pixels) + 1) // 2] if image is None else image)
         if image is None:
             return None
         stamp_ns = stamp_ns_from_msg(message)
@@ -324,13 +324,13 @@ class FrameInput:
             self._reporter.warn(self._undeclared)
         return image
 
-    def _look_for_light(self, image: AnyImage) -> None:
+    def _check_for_contrast(self, image: AnyImage) -> None:
         """Check now and then whether there is any picture: a blanked beam still gives frames."""
         now_s = time.monotonic()
         if now_s - self._looked_s < _LOOK_S:
             return
         self._looked_s = now_s
-        before, self._dark = self._dark, describe_darkness(image)
+        before, self._dark = self._dark, describe_blank_image(image)
         if self._dark and not before:
             self._reporter.warn(f"{self._dark}; check beam blank, shutter and detector")
         elif before and not self._dark:

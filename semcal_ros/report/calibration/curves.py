@@ -131,8 +131,10 @@ def draw_curve(
 def read_curve(axes: Axes, g: Array, texts: Sequence[str]) -> Readings:
     """Tell what curves say at every second sample, behind the magnification."""
     step = 2 if len(g) > _SAMPLES // 2 else 1
-    told = [f"{format_magnification(float(x))}: {text}" for x, text in zip(g, texts, strict=True)]
-    return Readings([axes], g[::step], told[::step])
+    readings = [
+        f"{format_magnification(float(x))}: {text}" for x, text in zip(g, texts, strict=True)
+    ]
+    return Readings([axes], g[::step], readings[::step])
 
 
 def set_limits_with_room(axes: Axes, values: Array, half_widths: Array) -> None:

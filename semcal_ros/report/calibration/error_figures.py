@@ -92,8 +92,8 @@ def plot_rms(
     axes, lengths = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     style_axes(axes, xlabel="", ylabel="RMS error (px)")
     style_axes(lengths, xlabel="magnification", ylabel="RMS error (nm)")
-    beside = PAPER_RMS_PX if paper else ()
-    for value, style in zip(beside, ("--", "-."), strict=False):
+    of_paper = PAPER_RMS_PX if paper else ()
+    for value, style in zip(of_paper, ("--", "-."), strict=False):
         axes.axhline(
             value, color=REFERENCE, linestyle=style, linewidth=1.2, label=f"paper: {value:g} px"
         )
@@ -109,7 +109,7 @@ def plot_rms(
     in_nm = np.concatenate([values, held]) * np.concatenate([pixel_nm, pixel_nm])
     in_nm = in_nm[np.isfinite(in_nm) & (in_nm > 0.0)]
     set_log_axis_y(lengths, 0.6 * float(in_nm.min()), 1.7 * float(in_nm.max()))
-    shown = np.concatenate([values, held, uncorrected, noise, beside])
+    shown = np.concatenate([values, held, uncorrected, noise, of_paper])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     set_log_axis_y(axes, 0.6 * float(shown.min()), 1.7 * float(shown.max()))
     add_legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
@@ -117,7 +117,7 @@ def plot_rms(
     return encode_figure(
         figure,
         f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px"
-        + (f", beside the paper's {beside[0]:g} and {beside[1]:g} px." if beside else "."),
+        + (f", beside the paper's {of_paper[0]:g} and {of_paper[1]:g} px." if of_paper else "."),
         "Held out: the images of this magnification, judged by a "
         "calibration from all other magnifications. Hollow: the lowest and highest one, which are "
         "extrapolated in this test. Corner noise: what the uncertainty of the corners alone "

@@ -95,15 +95,15 @@ def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]
     rms = rms_by_magnification(result.fit)
     rows = []
     for g, value in rms.items():
-        own = [v for v in result.views if v.magnification == g]
+        views = [v for v in result.views if v.magnification == g]
         camera = model.at(g)
         x, y = camera.pixel_size_m
         sigma = (None, None) if camera.covariance is None else camera.pixel_size_sigma_m
         rows.append(
             MagnificationRow(
                 magnification=f"{g:g}×",
-                views=len(own),
-                corners=sum(len(v.image_xy) for v in own),
+                views=len(views),
+                corners=sum(len(v.image_xy) for v in views),
                 rms=_format_error(value, x, y),
                 held_out=_format_error(result.held_out_rms_px.get(g), x, y),
                 extrapolated=g in result.held_out_rms_px and g in model.magnification_range,
@@ -145,7 +145,7 @@ def compute_fitted_inner_px(result: CalibrationResult) -> float | None:
 
 def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
     """Collect what was found about the calibration as sentences, the most costly first."""
-    return [_format_sentence(own.tell(result.model)) for own in find_all(result, rejected)]
+    return [_format_sentence(finding.tell(result.model)) for finding in find_all(result, rejected)]
 
 
 def _format_sentence(text: str) -> str:
