@@ -41,6 +41,8 @@ LONGEST = 5
 MANY = 10
 # Methods of a table of thresholds (semcal_ros/core/thresholds.py), by the kind of source.
 KINDS = ("derived", "measured", "defined", "cost", "stated")
+# Functions whose value is a number as their arguments are.
+NUMERIC = re.compile(r"(np|math)\.\w+|float|int|tuple|frozenset")
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 
 
@@ -184,14 +186,23 @@ def _kind_of_row(value: ast.expr | None) -> str | None:
 
 
 def _is_number(value: ast.expr | None) -> bool:
-    """Whether an expression is made of numbers alone: ``-2.0``, ``1 / 3``, ``(0.5, 1.6)``."""
+    """Whether an expression is made of numbers alone: ``-2.0``, ``(0.5, 1 / 3)``, ``np.linspace(0.0, 1.0, 5)``."""
     if isinstance(value, ast.Constant):
         return type(value.value) in (int, float)
     if isinstance(value, ast.Tuple | ast.List):
         return bool(value.elts) and all(map(_is_number, value.elts))
     if isinstance(value, ast.BinOp):
         return _is_number(value.left) and _is_number(value.right)
-    return isinstance(value, ast.UnaryOp) and _is_number(value.operand)
+    if isinstance(value, ast.UnaryOp):
+        return _is_number(value.operand)
+    if isinstance(value, ast.Attribute):
+        return ast.unparse(value) in ("np.pi", "math.pi")
+    return (
+        isinstance(value, ast.Call)
+        and NUMERIC.fullmatch(ast.unparse(value.func)) is not None
+        and bool(value.args)
+        and all(map(_is_number, value.args))
+    )
 
 
 def find_importers(modules: list[Module]) -> dict[str, set[str]]:

@@ -29,11 +29,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeVar
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["Source", "Table", "Threshold"]
 
-V = TypeVar("V", int, float, tuple[int, ...], tuple[float, ...])
+V = TypeVar("V", int, float, tuple[int, ...], tuple[float, ...], Array)
 
 
 class Source(Enum):
@@ -51,7 +52,7 @@ class Source(Enum):
     """Chosen by its author. The text says why, and what was seen; nothing here repeats it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Threshold:
     """One row.
 
@@ -70,7 +71,7 @@ class Threshold:
     """
 
     name: str
-    value: float | tuple[float, ...]
+    value: float | tuple[float, ...] | Array
     unit: str
     source: Source
     text: str

@@ -50,6 +50,8 @@ _D = 5.0  # beside it
 D_OF = {"a": 1}
 
 _E = 2**4
+_OF = np.array([1.0, np.pi])
+_NO = np.array([_E])
 
 
 @dataclass(frozen=True)
@@ -85,13 +87,13 @@ def test_everything_is_counted(house: ModuleType, tmp_path: Path) -> None:
     report = house.count_all(house.read_modules(tmp_path))
     assert report.figures == {
         "files": 3,
-        "lines of code": 5 + 15,
+        "lines of code": 5 + 17,
         "lines of imports": 1 + 3,
         "lines of __all__": 1,
         "modules with one importer": 1,
         "constants, comment": 4,
         "constants, measured": 1,
-        "constants, none": 1,
+        "constants, none": 2,
         "constants, stated": 1,
         "dataclasses in core/calibration": 0,
         "dataclasses in core/drift": 2,
@@ -99,8 +101,8 @@ def test_everything_is_counted(house: ModuleType, tmp_path: Path) -> None:
         "parameters of the longest list": 3,
     }
     assert report.one_importer == ["semcal_ros.core.drift.thresholds"]
-    assert report.without_source == ["core/drift/fit.py:17 _E"]
-    assert report.longest == ["3 core/drift/fit.py:29 fit"]
+    assert report.without_source == ["core/drift/fit.py:17 _E", "core/drift/fit.py:18 _OF"]
+    assert report.longest == ["3 core/drift/fit.py:31 fit"]
 
 
 def test_two_trees_stand_side_by_side(

@@ -34,7 +34,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32
-from semcal_ros.core.corners.thresholds import NEIGHBOUR_BLURS
+from semcal_ros.core.corners.thresholds import ERF_C, ERF_P, NEIGHBOUR_BLURS
 from semcal_ros.core.corners.window import PixelWindows
 
 __all__ = [
@@ -113,21 +113,16 @@ class EdgeGeometry:
         )
 
 
-# erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun
-# 7.1.26, error below 1.5e-7, as of single precision. It shares the exponential with the derivative.
-ERF_P = np.float32(0.3275911)
-# c1 to c5.
-ERF_C = tuple(
-    np.float32(c) for c in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
-)
+# It shares the exponential with the derivative.
+_P, _C = np.float32(ERF_P), tuple(np.float32(c) for c in ERF_C)
 
 
 def _erf_and_bell(z: Array32) -> tuple[Array32, Array32]:
     """Return erf(z / sqrt 2) and exp(-z^2 / 2)."""
     bell = np.exp(np.float32(-0.5) * z * z)
-    t = np.float32(1.0) / (np.float32(1.0) + (ERF_P * np.float32(np.sqrt(0.5))) * np.abs(z))
-    tail = t * ERF_C[4]
-    for coefficient in ERF_C[3::-1]:
+    t = np.float32(1.0) / (np.float32(1.0) + (_P * np.float32(np.sqrt(0.5))) * np.abs(z))
+    tail = t * _C[4]
+    for coefficient in _C[3::-1]:
         tail += coefficient
         tail *= t
     tail *= bell

@@ -25,6 +25,7 @@ from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.corners.saddle import SaddlePoints
 from semcal_ros.core.corners.thresholds import (
     CELLS_TO_RIM_MAX,
+    SADDLE_DIRECTION_MAX_DEG,
     SEARCH_RADIUS,
     SEED_ASYMMETRY_MAX,
     SEED_NEIGHBOURS,
@@ -35,8 +36,7 @@ from semcal_ros.core.corners.thresholds import (
 __all__ = ["Lattice", "enlarged", "grow_best_lattice"]
 
 
-# In skewed cells the directions of a saddle are off by a few degrees, and noise adds to that.
-COSINE_MIN = float(np.cos(np.deg2rad(28.0)))
+COSINE_MIN = float(np.cos(np.deg2rad(SADDLE_DIRECTION_MAX_DEG)))
 # From a cell to its four neighbours.
 STEPS: Indices = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 

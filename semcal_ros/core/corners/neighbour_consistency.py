@@ -27,6 +27,8 @@ from semcal_ros.core.corners.thresholds import (
     LARGE_SQUARE_PX,
     MAP_ERROR_PX,
     MAP_ERROR_RATIO,
+    MEDIAN_SIGMA_1,
+    MEDIAN_SIGMA_2,
     RESIDUAL_SIGMAS,
     SCATTER_SIGMAS,
     SUPPORT_MIN,
@@ -36,9 +38,8 @@ from semcal_ros.core.corners.thresholds import (
 __all__ = ["estimate_scatter_px", "find_consistent"]
 
 
-# Relative 1-sigma of the median of n chi-squares by their degrees of freedom, times sqrt(n): half the inverse of the
-# density at the median, over the median.
-MEDIAN_SIGMA = {1: 2.333, 2: 1.0 / np.log(2.0)}
+# By the number of dimensions.
+MEDIAN_SIGMA = {1: MEDIAN_SIGMA_1, 2: MEDIAN_SIGMA_2}
 
 
 def find_consistent(cells: Indices, maps: LocalMaps, fit: PositionFit, good: Mask) -> Mask:

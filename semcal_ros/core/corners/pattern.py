@@ -34,14 +34,22 @@ from scipy.special import j1
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners.thresholds import (
     AMBIGUOUS_RATIO,
+    ARM_LENGTHS,
+    ARM_WIDTHS,
+    CHESS_SIZES,
     COMPARABLE_RATIO,
     HARMONIC_ORDERS,
     LINES_OPENING_MIN,
+    MOTIF_BLURS,
+    MOTIF_SIZES,
     MOTIF_STEP,
     ODDS_MAX,
     RELIEF_ASIDE_MIN,
     RELIEF_GAIN_MIN,
     RELIEF_MISFIT_MAX,
+    RELIEF_SHIFTS,
+    RIM_DIMNESS,
+    RIM_WIDTHS,
     SHAPE_MISFIT_LEAST,
     SHAPES_FOR_CENTRE,
 )
@@ -77,18 +85,6 @@ PATTERN_NAMES = {
 
 # What is taken for likely where nothing else decides, first to last.
 _COMMONEST: dict[Pattern, int] = {"chess": 0, "dots": 1, "lines": 1, "crosses": 2}
-# Diameters of discs and sides of squares, in cells; and blurs.
-SIZES: Array = np.linspace(0.08, 0.98, 46)
-CHESS_SIZES: Array = np.linspace(0.82, 1.0, 10)
-BLURS: Array = np.linspace(0.0, 0.24, 13)
-# Half lengths of the arms of crosses, from their centre, and widths of the arms, in cells. Longer arms meet: lines.
-ARM_LENGTHS: Array = np.linspace(0.2, 0.44, 7)
-ARM_WIDTHS: Array = np.linspace(0.06, 0.42, 13)
-# Edges are brighter than faces: a rim of this width, in cells, and the part of its brightness that the face lacks.
-RIMS: Array = np.array([0.05, 0.1])
-DIMNESS: Array = np.array([0.25, 0.5, 0.75])
-# Where a relief may have shifted the centre of symmetry to, in cells.
-RELIEF_SHIFTS: Array = np.linspace(-0.2, 0.2, 9)
 
 
 @dataclass(frozen=True)
@@ -253,8 +249,8 @@ def _harmonics() -> tuple[Array, Array]:
 
 def _list_rims(width: float) -> list[tuple[float, float]]:
     """Return no rim, and the rims that a face of this width can have, each with how much dimmer the face is."""
-    rims = [float(rim) for rim in RIMS if 2.0 * rim < width]
-    return [(0.0, 0.0), *((rim, float(dimness)) for rim in rims for dimness in DIMNESS)]
+    rims = [float(rim) for rim in RIM_WIDTHS if 2.0 * rim < width]
+    return [(0.0, 0.0), *((rim, float(dimness)) for rim in rims for dimness in RIM_DIMNESS)]
 
 
 def _disc(size: float, radius: Array) -> Array:
@@ -283,7 +279,7 @@ def _shapes() -> _Shapes:
     rows: list[tuple[bool, float, float, Array]] = []
 
     def add(name: Pattern, size: float, transform: Array) -> None:
-        for blur in BLURS:
+        for blur in MOTIF_BLURS:
             soft = transform * np.exp(-2.0 * np.pi**2 * blur**2 * radius**2)
             for centred in (True, False):
                 # A shift by half a cell along both axes.
@@ -291,7 +287,7 @@ def _shapes() -> _Shapes:
                 names.append(name)
                 rows.append((centred, size, float(blur), moved / np.linalg.norm(moved)))
 
-    for size in map(float, SIZES):
+    for size in map(float, MOTIF_SIZES):
         # Openings wider than this leave lines between them; narrower ones are square dots.
         squares: Pattern = "lines" if size >= LINES_OPENING_MIN else "dots"
         # With rims, pads and wide bars could not be told apart.

@@ -46,6 +46,7 @@ from semcal_ros.core.corners.thresholds import (
     LIKELIHOOD_LOSS,
     LOG_BLUR_PRIOR,
     OUTLIER_SCORE,
+    PRIOR_SPREADS,
     SAGITTA_PRIOR_PX,
 )
 
@@ -53,9 +54,6 @@ __all__ = ["Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
 
 
 PARAMETERS = NONLINEAR + LINEAR
-# Spreads that are tried, relative to the loose ones above; those above 1 only where the corners show
-# more than the loose ones allow.
-SPREADS: Array = np.concatenate([np.geomspace(0.02, 1.0, 14), np.geomspace(1.35, 11.0, 8)])
 # Parameters that share one spread.
 GROUPS = (ANGLES, slice(LOG_BLUR, LOG_BLUR + 1), SAGITTAS, *GRADIENTS, GROWTH)
 # Parameters with a value that is common to all corners of an image.
@@ -170,13 +168,13 @@ def _weighted_median(values: Array, weights: Array) -> Array:
 
 def _largest_spread(score: Array, variance: Array) -> float:
     """Return the largest spread that scores with these variances do not contradict."""
-    total = SPREADS[:, None] ** 2 + variance
+    total = PRIOR_SPREADS[:, None] ** 2 + variance
     # Corners under debris count no more than others at three standard deviations.
     cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER_SCORE)).sum(axis=1)
     plausible = cost <= cost.min() + LIKELIHOOD_LOSS
-    if SPREADS[np.argmin(cost)] <= 1.0:
-        plausible &= SPREADS <= 1.0
-    return float(SPREADS[np.nonzero(plausible)[0][-1]])
+    if PRIOR_SPREADS[np.argmin(cost)] <= 1.0:
+        plausible &= PRIOR_SPREADS <= 1.0
+    return float(PRIOR_SPREADS[np.nonzero(plausible)[0][-1]])
 
 
 def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) -> Prior:

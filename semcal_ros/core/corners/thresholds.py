@@ -20,6 +20,8 @@ In the order of the modules that use them first. "Seen" stands for what was obse
 
 from __future__ import annotations
 
+import numpy as np
+
 from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
@@ -85,6 +87,12 @@ CELLS_TO_RIM_MAX = TABLE.cost(
     "From the seed to the rim: with more than 1000 in a row, a tenth of a gigabyte.",
 )
 
+SADDLE_DIRECTION_MAX_DEG = TABLE.stated(
+    "SADDLE_DIRECTION_MAX_DEG", 28.0, "deg",
+    "Between an arm and the direction of its saddle: in skewed cells directions are off by a few degrees, and "
+    "noise adds to that.",
+)
+
 # Local maps, in local_map.py
 
 CUBIC_BELOW = TABLE.stated(
@@ -125,6 +133,16 @@ NEIGHBOUR_BLURS = TABLE.derived(
     "step is left.",
 )
 
+ERF_P = TABLE.derived(
+    "ERF_P", 0.3275911, "1",
+    "erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun 7.1.26, "
+    "error below 1.5e-7, as of single precision.",
+)
+ERF_C = TABLE.derived(
+    "ERF_C", (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429), "1",
+    "c1 to c5 of the same.",
+)
+
 # Priors of the fit of corners, in priors.py
 
 ANGLE_PRIOR = TABLE.derived(
@@ -163,6 +181,11 @@ LIKELIHOOD_LOSS = TABLE.derived(
 OUTLIER_SCORE = TABLE.derived(
     "OUTLIER_SCORE", 9.0, "score^2",
     "Where an outlier's weight ends: three standard deviations, squared.",
+)
+
+PRIOR_SPREADS = TABLE.stated(
+    "PRIOR_SPREADS", np.concatenate([np.geomspace(0.02, 1.0, 14), np.geomspace(1.35, 11.0, 8)]), "of the priors",
+    "That are tried; those above 1 only where the corners show more than the priors allow.",
 )
 
 # The fit of corners, in corner_fit.py
@@ -323,6 +346,15 @@ TREND_DEGREE = TABLE.stated(
     "keep single ones from bending it.",
 )
 
+MEDIAN_SIGMA_1 = TABLE.derived(
+    "MEDIAN_SIGMA_1", 2.333, "of the median",
+    "1-sigma of the median of n chi-squares of one degree, times sqrt(n): 1 / (2 x density x median) there.",
+)
+MEDIAN_SIGMA_2 = TABLE.derived(
+    "MEDIAN_SIGMA_2", float(1.0 / np.log(2.0)), "of the median",
+    "The same of two degrees of freedom: 1 / log 2.",
+)
+
 # What the motif of a cell is, in pattern.py
 
 HARMONIC_ORDERS = TABLE.stated(
@@ -371,6 +403,39 @@ RELIEF_ASIDE_MIN = TABLE.stated(
 ODDS_MAX = TABLE.defined(
     "ODDS_MAX", 1e6, "odds",
     "Odds beyond a million say nothing more.",
+)
+
+MOTIF_SIZES = TABLE.stated(
+    "MOTIF_SIZES", np.linspace(0.08, 0.98, 46), "cells",
+    "Diameters of discs and sides of squares that are tried.",
+)
+CHESS_SIZES = TABLE.stated(
+    "CHESS_SIZES", np.linspace(0.82, 1.0, 10), "cells",
+    "The same of the squares of a checkerboard.",
+)
+MOTIF_BLURS = TABLE.stated(
+    "MOTIF_BLURS", np.linspace(0.0, 0.24, 13), "cells",
+    "Blurs that are tried.",
+)
+ARM_LENGTHS = TABLE.stated(
+    "ARM_LENGTHS", np.linspace(0.2, 0.44, 7), "cells",
+    "Half lengths of the arms of crosses, from their centre; longer ones meet, and are lines.",
+)
+ARM_WIDTHS = TABLE.stated(
+    "ARM_WIDTHS", np.linspace(0.06, 0.42, 13), "cells",
+    "Widths of these arms.",
+)
+RIM_WIDTHS = TABLE.stated(
+    "RIM_WIDTHS", np.array([0.05, 0.1]), "cells",
+    "Edges are brighter than faces.",
+)
+RIM_DIMNESS = TABLE.stated(
+    "RIM_DIMNESS", np.array([0.25, 0.5, 0.75]), "of the rim",
+    "The part of its brightness that the face lacks.",
+)
+RELIEF_SHIFTS = TABLE.stated(
+    "RELIEF_SHIFTS", np.linspace(-0.2, 0.2, 9), "cells",
+    "To which a relief may have shifted the centre of symmetry.",
 )
 
 # The unit cell, in unit_cell.py

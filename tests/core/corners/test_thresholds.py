@@ -36,7 +36,10 @@ def test_no_number_of_the_room_stands_elsewhere() -> None:
     modules = house.read_modules(ROOT, "core/corners")
     named = {m.path: [name for name, _, _ in house.find_constants(m)] for m in modules}
     assert len(named.pop("core/corners/thresholds.py")) == len(list(t.TABLE)) > 100
-    assert {path: names for path, names in named.items() if names} == {}
+    # From a cell to its four neighbours: geometry, and nothing that could be otherwise.
+    assert {p: names for p, names in named.items() if names} == {
+        "core/corners/lattice.py": ["STEPS"]
+    }
 
 
 def test_every_number_is_used_and_has_a_unit_and_a_source() -> None:
@@ -48,7 +51,7 @@ def test_every_number_is_used_and_has_a_unit_and_a_source() -> None:
         if isinstance(node, ast.Name)
     }
     for row in t.TABLE:
-        assert getattr(t, row.name) == row.value
+        assert getattr(t, row.name) is row.value
         assert row.unit and row.text.endswith("."), row
         assert row.name in used, row
 
@@ -101,12 +104,30 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
         (np.sqrt(t.SADDLE_THRESHOLD), 0.32, 0.005),
         # The second derivative of a step that a normal distribution of sigma 1 blurs is 0.242 at most.
         (0.242 / 8.0 / t.SAMPLES_PER_KNOT**2, 0.002, 0.0002),
+        # 1 / (2 density median) of a chi-square.
+        (
+            t.MEDIAN_SIGMA_1,
+            0.5 / (stats.chi2.pdf(stats.chi2.median(1), 1) * stats.chi2.median(1)),
+            1e-3,
+        ),
+        (
+            t.MEDIAN_SIGMA_2,
+            0.5 / (stats.chi2.pdf(stats.chi2.median(2), 2) * stats.chi2.median(2)),
+            1e-9,
+        ),
         # What is left of a step at a distance of so many blur widths.
         (0.5 * special.erfc(t.NEIGHBOUR_BLURS * t.WINDOW_HALF_WIDTH / np.sqrt(2.0)), 3e-5, 3e-6),
     ],
 )
 def test_figures_follow_from_what_is_stated(value: float, stated: float, within: float) -> None:
     assert value == pytest.approx(stated, abs=within)
+
+
+def test_the_error_function_is_as_good_as_its_source_says() -> None:
+    z = np.linspace(0.0, 5.0, 5001)
+    step = 1.0 / (1.0 + t.ERF_P * z)
+    series = sum(c * step**k for k, c in enumerate(t.ERF_C, 1))
+    assert np.abs(1.0 - series * np.exp(-(z**2)) - special.erf(z)).max() < 1.5e-7
 
 
 def test_the_side_lobes_of_the_window_are_below_what_counts() -> None:
