@@ -33,7 +33,7 @@ from semcal_ros.core.errors import ConfigError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Environment
 from semcal_ros.middleware.ament_prefix import prefixes_of_user
-from semcal_ros.middleware.fastdds_profile import (
+from semcal_ros.middleware.transport_advice import (
     SharedMemory,
     local_only,
     profile_file,
