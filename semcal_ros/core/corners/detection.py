@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array, Image, Indices
+from semcal_ros.core.corners.checks import estimate_scatter_px
 from semcal_ros.core.corners.crossed_waves import find_cells
 from semcal_ros.core.corners.dots_and_lines import (
     bright_cells,
@@ -45,7 +46,6 @@ from semcal_ros.core.corners.grating import find_lines, fit_lines
 from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import estimate_scatter_px
 from semcal_ros.core.corners.pattern import (
     PATTERN_NAMES,
     CellShape,

@@ -24,6 +24,7 @@ from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.checks import (
     FittedCorners,
     contrast_signs,
+    find_consistent,
     find_credible,
     find_undisturbed,
     inflate_variance,
@@ -39,7 +40,6 @@ from semcal_ros.core.corners.corner_fit import (
 from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
 from semcal_ros.core.corners.lattice import STEPS, Lattice
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import find_consistent
 from semcal_ros.core.corners.priors import (
     Learnt,
     learn,

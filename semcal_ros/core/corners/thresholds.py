@@ -319,7 +319,7 @@ CORNERS_COMPARED_MIN = TABLE.derived(
     "A quadratic map has six coefficients per coordinate: fewer corners cannot be compared with each other.",
 )
 
-# Corners against their neighbours, in neighbour_consistency.py
+# Corners against their neighbours, in checks.py
 
 RESIDUAL_SIGMAS = TABLE.derived(
     "RESIDUAL_SIGMAS", (5.0, 4.3, 3.7), "sigma",
