@@ -57,11 +57,17 @@ from semcal_ros.nodes.frames.conditions import ConditionsInput
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedFrame, ViewedImages
-from semcal_ros.viewer.coverage import describe_acquisition, describe_coverage, describe_run
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.server import PageServer
 from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Status, View
-from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
+from semcal_ros.viewer.state import (
+    DriftTrace,
+    describe_acquisition,
+    describe_coverage,
+    describe_magnification,
+    describe_run,
+    drift_in_pixels,
+)
 
 __all__ = ["Viewer", "give_way", "run_viewer"]
 

@@ -12,12 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The virtual microscope: a camera for every magnification, with its scan timing and its operating conditions."""
+"""The virtual microscope: a camera for every magnification, with its scan timing and its operating conditions.
+
+Its parameters change with the magnification by laws. None of them is a polynomial in g or in log g: a calibration that
+fits such polynomials meets a curve that it can only approximate, as with a real microscope, so that a test against it
+is meaningful.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,12 +32,16 @@ from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.synthetic.laws import Constant, Law
 
 __all__ = [
     "SIMULATED_VOLTAGE_V",
     "SIMULATED_WORKING_DISTANCE_M",
+    "Constant",
+    "Exponential",
+    "Law",
+    "Logistic",
     "Residual",
+    "Saturation",
     "VirtualMicroscope",
     "conditions_of",
 ]
@@ -281,3 +291,69 @@ def conditions_of(
         "maker": "semcal_ros",
         "model": microscope.name,
     }
+
+
+class Law(Protocol):
+    """A parameter as a function of g; hashable, because the rendered geometry is cached."""
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        ...
+
+    def __hash__(self) -> int:
+        """Equal laws have equal hashes."""
+        ...
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same value at every magnification."""
+
+    value: float
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        return self.value
+
+
+@dataclass(frozen=True)
+class Exponential:
+    """``high + (low - high) exp(-g / scale)``: ``low`` at g = 0, ``high`` far above ``scale``."""
+
+    low: float
+    high: float
+    scale: float
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        return self.high + (self.low - self.high) * math.exp(-magnification / self.scale)
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """``low + (high - low) g^n / (g^n + half^n)``: half way between the ends at ``g = half``."""
+
+    low: float
+    high: float
+    half: float
+    exponent: float = 1.0
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        fraction = 1.0 / (1.0 + (self.half / magnification) ** self.exponent)
+        return float(self.low + (self.high - self.low) * fraction)
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """``low + (high - low) / (1 + exp(-(g - middle) / width))``."""
+
+    low: float
+    high: float
+    middle: float
+    width: float
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        fraction = 0.5 * (1.0 + math.tanh(0.5 * (magnification - self.middle) / self.width))
+        return float(self.low + (self.high - self.low) * fraction)

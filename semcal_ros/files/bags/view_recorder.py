@@ -30,8 +30,8 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
-from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.files.bags.microscope_messages import (
+from semcal_ros.files.bags.messages import (
+    blank_message,
     check_recordable,
     conditions_message,
     magnification_message,

@@ -37,8 +37,8 @@ from semcal_ros.config.config import (
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
-from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.files.bags.microscope_messages import (
+from semcal_ros.files.bags.messages import (
+    blank_message,
     check_recordable,
     conditions_message,
     magnification_message,

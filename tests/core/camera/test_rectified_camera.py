@@ -32,7 +32,7 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import Detector, Pose, preset, render_frame
-from semcal_ros.synthetic.laws import Constant
+from semcal_ros.synthetic.microscope import Constant
 from semcal_ros.synthetic.specimens.grid import ChessGrid
 
 SIZE = (512, 384)
