@@ -21,8 +21,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["SCALE_PREFIX", "ScaleWarnings", "read_scale_warnings"]
-
 SCALE_PREFIX = "scale:"
 """Begin of the warnings that judge nm per pixel."""
 

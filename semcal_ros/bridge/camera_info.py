@@ -27,7 +27,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 if TYPE_CHECKING:  # its fit needs scipy.optimize, which takes long to import
     from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
 
-__all__ = ["fill_camera_info", "fill_raw_camera_info"]
 
 # Matrices of three rows, row by row.
 _ZEROS: list[float] = [0.0] * 9

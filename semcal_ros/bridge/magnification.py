@@ -31,14 +31,6 @@ from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
-__all__ = [
-    "MAGNIFICATION_LIMITS",
-    "MagnificationReading",
-    "check_magnification",
-    "published_number",
-    "read_magnification",
-]
-
 MAGNIFICATION_LIMITS = (1.0, 1e8)
 """No SEM shows less than life size; at the upper limit a display of 0.12 m would show 1.2 nm."""
 

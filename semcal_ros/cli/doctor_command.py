@@ -30,8 +30,6 @@ from semcal_ros.doctor.findings import Finding, Severity, explain_figures
 from semcal_ros.doctor.recording import diagnose_recording
 from semcal_ros.files.images.image_series import refuse_images
 
-__all__ = ["command"]
-
 _ORDER = (Severity.PROBLEM, Severity.NOTE, Severity.OK)
 
 

@@ -39,9 +39,6 @@ from semcal_ros.workflows.describe_recording import (
     describe_recording,
 )
 
-__all__ = ["command"]
-
-
 # A sweep has as many magnifications as frames: of more than this, the middle ones are left out.
 _MOST_ROWS = 24
 

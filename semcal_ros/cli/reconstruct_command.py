@@ -42,8 +42,6 @@ from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.workflows.measure_relief import RELIEF_SUFFIXES, measure_relief
 from semcal_ros.workflows.reconstruct import reconstruct
 
-__all__ = ["command"]
-
 
 @click.command("reconstruct")
 @recording_input

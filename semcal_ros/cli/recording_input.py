@@ -31,17 +31,6 @@ from semcal_ros.files.images.image_file import is_image_file
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import resolve_config
 
-__all__ = [
-    "PIXEL_SIZE_AT",
-    "PixelSizeAt",
-    "check_outputs",
-    "check_spared",
-    "optional_recording_input",
-    "recording_input",
-    "recordings_input",
-    "refuse_mask",
-]
-
 Command = TypeVar("Command", bound=Callable[..., Any])
 Output = tuple[str, Path | None, Sequence[str]]
 

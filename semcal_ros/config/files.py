@@ -32,14 +32,6 @@ from semcal_ros.core.errors import ConfigError
 from semcal_ros.core.wording import did_you_mean
 from semcal_ros.text_files import CONSTRUCTOR_ERRORS, read_text_file
 
-__all__ = [
-    "config_directories",
-    "config_names",
-    "find_config_file",
-    "load_yaml",
-    "read_config_text",
-]
-
 _SUFFIXES = (".yaml", ".yml")
 _MAX_BYTES = 1024 * 1024  # the commented template has 3 kB; this only keeps other files out
 _MAX_REASON = 80  # a longer one would not fit on a line beside the name of the file

@@ -32,8 +32,6 @@ from typing import TypeVar
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Source", "Table", "Threshold"]
-
 V = TypeVar("V", int, float, tuple[int, ...], tuple[float, ...], Array)
 
 

@@ -23,8 +23,6 @@ from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import CalibrationSeen, Session
 
-__all__ = ["check_calibration", "describe_calibration", "live_size"]
-
 # One row in a thousand: the change of shape when a scaled size is rounded.
 _ASPECT = 1e-3
 

@@ -57,8 +57,6 @@ from semcal_ros.doctor.stream_checks import (
     describe_magnifications,
 )
 
-__all__ = ["diagnose", "evaluate", "judge_calibrations"]
-
 
 def diagnose(
     config_name: str, calibration: Path | None, namespace: str, seconds: float

@@ -40,22 +40,6 @@ from semcal_ros.middleware.transport_advice import (
     shared_memory,
 )
 
-__all__ = [
-    "ENVIRONMENT_CHECKS",
-    "check_discovery",
-    "check_domain",
-    "check_one_ros",
-    "check_package_index",
-    "check_packages",
-    "check_profile",
-    "check_python",
-    "check_rclpy",
-    "check_rmw",
-    "check_shared_memory",
-    "check_socket_buffers",
-    "collect_environment",
-]
-
 _PYTHON = ((3, 10), (3, 14))  # as in the Makefile
 _GET_ROS = (
     "run `make setup` and use .venv/bin/semcal, or install the wheels that requirements/ names, or source the"

@@ -20,8 +20,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Finding", "Severity", "explain_figures", "note", "ok", "problem"]
-
 # Words in a finding, and what the figure beside them is.
 _FIGURES = (
     (" Hz", "Hz: messages per second while this command listened, or in the recording"),

@@ -51,8 +51,6 @@ from semcal_ros.doctor.observations import (
 from semcal_ros.doctor.stream_checks import describe_image
 from semcal_ros.middleware.message_types import message_class
 
-__all__ = ["observe"]
-
 # Time for discovery, before which nothing is known.
 _DISCOVERY_S = 1.0
 # Longest wait for the parameter services, and again for their answers: a busy node answers late, a

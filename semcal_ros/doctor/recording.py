@@ -44,8 +44,6 @@ from semcal_ros.doctor.stream_checks import (
 from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag
 from semcal_ros.files.bags.topics import topic_matches
 
-__all__ = ["diagnose_recording"]
-
 _RECORDING = "the recording"
 _CALIBRATION = "calibration"
 # Bytes of the encapsulation; after it comes the stamp of a message that begins with std_msgs/Header.

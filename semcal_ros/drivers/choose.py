@@ -28,8 +28,6 @@ from semcal_ros.drivers.openfibsem import OpenFibsemSource, require_fibsem
 from semcal_ros.drivers.source import FrameSource
 from semcal_ros.drivers.video import SideFile, VideoSource
 
-__all__ = ["SOURCES", "Settings", "make_source"]
-
 
 class Settings(Protocol):
     """Values of the parameters of the node, by name."""

@@ -39,8 +39,6 @@ from semcal_ros.drivers.source import SourceFrame
 from semcal_ros.files.images.image_file import ImagePage, describe_image_file, is_image_file
 from semcal_ros.files.video import VIDEO_SUFFIXES
 
-__all__ = ["FolderSource"]
-
 # A file that was closed or renamed into place is most often complete; a program that opens it once more, to append its
 # metadata, does so within milliseconds.
 _CLOSED_S = 0.05

@@ -23,8 +23,6 @@ from dataclasses import dataclass, field
 from semcal_ros.core.errors import MicroscopeError
 from semcal_ros.drivers.source import JOINTS
 
-__all__ = ["MotionLimits", "describe_target", "joint_unit"]
-
 # Rounding of a position that is asked for at a limit itself.
 _ROUNDING = 1e-9
 

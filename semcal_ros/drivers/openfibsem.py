@@ -32,8 +32,6 @@ import numpy as np
 from semcal_ros.core.errors import ConfigError, MicroscopeError
 from semcal_ros.drivers.source import SourceFrame
 
-__all__ = ["MANUFACTURERS", "OpenFibsemSource", "require_fibsem"]
-
 # Class, and port of the server, as fibsem itself chooses them. Its own setup_session is not used: on connecting it sets
 # the beam shift to zero, and nothing is to be changed at a microscope that is only looked at.
 MANUFACTURERS: Mapping[str, tuple[str, str, int]] = {

@@ -28,8 +28,6 @@ import numpy as np
 from semcal_ros.core.errors import MicroscopeError, UnusableFrameError
 from semcal_ros.drivers.source import SourceFrame
 
-__all__ = ["SideFile", "VideoSource"]
-
 # A grabber without a signal, or a stream whose server is gone, is given up after this time.
 _TIMEOUT_S = 5.0
 # From more bits than this a component has grey levels worth 16 bit.

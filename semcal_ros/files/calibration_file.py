@@ -45,16 +45,6 @@ from semcal_ros.files.atomic import atomic_write_text
 from semcal_ros.files.plain_yaml import load_plain_yaml
 from semcal_ros.text_files import read_text_file
 
-__all__ = [
-    "FILE_VERSION",
-    "format_calibration",
-    "parse_calibration",
-    "read_calibration",
-    "read_calibration_text",
-    "write_calibration",
-]
-
-
 # What is written. Version 1 has no provenance; a file with a number that is not listed is refused.
 FILE_VERSION = 3
 _READ_VERSIONS = (1, 2, FILE_VERSION)

@@ -33,15 +33,6 @@ from semcal_ros.core.camera.pinhole_model import PinholeModel
 from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = [
-    "compute_raw_map",
-    "format_colmap",
-    "format_macro",
-    "format_mrcal",
-    "format_opencv",
-    "format_ros",
-]
-
 
 def format_opencv(
     camera: PinholeModel, pixel_size_m: tuple[float, float], notes: Sequence[str]

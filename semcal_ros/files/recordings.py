@@ -60,16 +60,6 @@ from semcal_ros.files.tiff.sem_image import Conditions
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = [
-    "ENCODINGS",
-    "FrameOutline",
-    "RecordedFiles",
-    "RecordedFrame",
-    "Recording",
-    "RejectedFrame",
-    "open_image_series",
-    "open_recording",
-]
 
 T = TypeVar("T")
 

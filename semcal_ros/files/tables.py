@@ -27,8 +27,6 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.text_files import read_text_file
 
-__all__ = ["DRIFT_COLUMNS", "SIMILARITY_COLUMNS", "TABLE_SUFFIXES", "read_table", "write_table"]
-
 DRIFT_COLUMNS = (
     "stamp_ns",
     "dx_m",

@@ -36,20 +36,6 @@ from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.scale_bar import ScaleBar, draw_scale_bar
 
-__all__ = [
-    "FPS_RANGE",
-    "VIDEO_CODECS",
-    "VIDEO_SUFFIXES",
-    "VideoCodec",
-    "VideoDescription",
-    "VideoWriter",
-    "check_video",
-    "describe_video",
-    "open_video",
-    "read_video",
-    "shade",
-]
-
 #: Frames per second that can be asked for: a frame in ten seconds, and the fastest common displays.
 FPS_RANGE = (0.1, 240.0)
 #: Suffixes of files that are opened as videos.

@@ -36,17 +36,6 @@ from xml.etree import ElementTree
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.text_files import read_text_file
 
-__all__ = [
-    "DEFAULT_SEGMENT_BYTES",
-    "MALLOC_VARIABLES",
-    "PROFILE_VARIABLES",
-    "SharedMemory",
-    "local_only",
-    "profile_file",
-    "shared_memory",
-    "transport_advice",
-]
-
 MALLOC_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
 """What glibc reads at the start of a process (mallopt(3))."""
 

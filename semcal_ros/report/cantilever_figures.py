@@ -53,15 +53,6 @@ from semcal_ros.report.html.style import (
     style_axes,
 )
 
-__all__ = [
-    "draw_deflection",
-    "plot_poses",
-    "plot_strip",
-    "write_bending_video",
-    "write_poses_figure",
-    "write_strip_figure",
-]
-
 # Resolution of figures, dots per inch.
 _DPI = 90.0
 _COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)

@@ -44,8 +44,6 @@ from semcal_ros.report.html.style import (
     style_axes,
 )
 
-__all__ = ["plot_ball", "plot_relief", "render_ball", "write_ball_figure", "write_relief_figure"]
-
 # nm in a metre.
 _NM = 1e9
 # Resolution: 1056 px across the figure of 9.6 inches.

@@ -26,8 +26,6 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["grid_view", "grid_views"]
-
 
 def grid_view(
     camera: ScanCamera,

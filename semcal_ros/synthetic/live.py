@@ -34,9 +34,6 @@ from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.grid import GridFaults, Specimen
 from semcal_ros.synthetic.stage import SimulatedStage, visit_scales
 
-__all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
-
-
 # Changes of magnification that are remembered, for frames that have begun before them.
 _KEPT_SETTINGS = 16
 # Commands of the stage that are remembered, for the same reason.

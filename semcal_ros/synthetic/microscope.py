@@ -33,19 +33,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "SIMULATED_VOLTAGE_V",
-    "SIMULATED_WORKING_DISTANCE_M",
-    "Constant",
-    "Exponential",
-    "Law",
-    "Logistic",
-    "Residual",
-    "Saturation",
-    "VirtualMicroscope",
-    "conditions_of",
-]
-
 # A fixed-point step multiplies the error by the residual's derivative: from 10 px, 60 steps reach
 # the tolerance for derivatives up to 0.65.
 _FIXED_POINT_STEPS = 60

@@ -49,20 +49,6 @@ from semcal_ros.synthetic.stage import (
     visit_scales,
 )
 
-__all__ = [
-    "CALIBRATION_MAGNIFICATIONS",
-    "SPECIMEN_KINDS",
-    "PlannedFrame",
-    "RecordingPlan",
-    "calibration_plan",
-    "drift_plan",
-    "ladder_plan",
-    "specimen_for",
-    "steps_plan",
-    "zoom_plan",
-]
-
-
 SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target", "rough_target")
 
 CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in range(1, 21)))

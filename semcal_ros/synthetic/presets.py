@@ -31,8 +31,6 @@ from semcal_ros.synthetic.microscope import (
     VirtualMicroscope,
 )
 
-__all__ = ["PRESETS", "preset"]
-
 
 def _jsm820() -> VirtualMicroscope:
     # Only the distortion centre has the values of the tables of Malti et al. (2012),

@@ -30,9 +30,6 @@ from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.specimens.grid import Specimen, UnevenSpecimen
 from semcal_ros.synthetic.specimens.ray_lattice import PlaneLattice, trace_ray_lattice
 
-__all__ = ["render_frame", "render_reflectivity"]
-
-
 # Pixel rows that are drawn at once, so that a block's arrays stay in the CPU's cache: 1 MiB for
 # each coordinate at 4096 columns without supersampling.
 _BLOCK_ROWS = 32

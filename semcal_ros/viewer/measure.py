@@ -25,8 +25,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PICTURES", "Distance", "digits_of", "format_with_sigma", "measure_distance"]
-
 PICTURES = ("raw", "corrected")
 """The pictures in which can be measured."""
 _UNITS = ((1e-6, "µm"), (1e-9, "nm"))

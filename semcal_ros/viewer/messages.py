@@ -42,16 +42,6 @@ from semcal_ros.viewer.pictures import (
 )
 from semcal_ros.viewer.source import View
 
-__all__ = [
-    "ViewRequest",
-    "describe_distance",
-    "encode_overlay",
-    "encode_view",
-    "measure",
-    "read_value",
-    "read_view_request",
-]
-
 # A page that asks for more gets this: the longest side of a screen with room to spare.
 _LARGEST_WIDTH_PX = 4096
 

@@ -40,8 +40,6 @@ from semcal_ros.viewer.source import DriftPanel, Note, Rate, Status, Timeline, V
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 from semcal_ros.workflows.follow_drift import DriftFollower, camera_for, start_time_s
 
-__all__ = ["RecordingSource"]
-
 # A frame that is further ahead is looked up; the frames up to it are read, as a video is.
 _SKIPPED = 16
 # Longest wait between two frames while playing: somebody who looks through a slow series does not want to wait.

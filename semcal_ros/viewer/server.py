@@ -48,8 +48,6 @@ from semcal_ros.viewer.messages import (
 )
 from semcal_ros.viewer.source import ACTIONS, View, ViewSource
 
-__all__ = ["LOCAL_HOSTS", "PageServer"]
-
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names of this computer by which only its own users come in; no token is asked of them."""
 

@@ -29,15 +29,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.viewer.measure import format_with_sigma
 from semcal_ros.viewer.source import AcquisitionPanel, Bar, DriftPanel, Magnification
 
-__all__ = [
-    "DriftTrace",
-    "describe_acquisition",
-    "describe_coverage",
-    "describe_magnification",
-    "describe_run",
-    "drift_in_pixels",
-]
-
 # Points of the trace that the page draws: as many as it has pixels across.
 _DRAWN = 300
 # About a day at ten frames per second would be a million; a smooth way needs far fewer.

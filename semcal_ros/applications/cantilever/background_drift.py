@@ -45,9 +45,6 @@ from semcal_ros.core.registration.register import (
 )
 from semcal_ros.core.wording import omit_numbers
 
-__all__ = ["Background", "GroundRegion", "follow_background"]
-
-
 # The rough drift is measured in an image reduced to between 256 and 512 px along its shorter side,
 # by the median shift of its tiles.
 _FIRST_PX = 256

@@ -36,20 +36,6 @@ from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 
-__all__ = [
-    "SHAPES",
-    "Bending",
-    "Shape",
-    "evaluate_bending",
-    "expect_point_load",
-    "fit_bending",
-    "fit_common_shape",
-    "locate_end",
-    "locate_load",
-    "parse_shape",
-]
-
-
 SHAPES = ("free", "beam", "parabola")
 
 # 1-sigma of the rotation between frames, rad: the raster and a clamp are that stable.

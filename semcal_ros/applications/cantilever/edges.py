@@ -29,18 +29,6 @@ from scipy.special import ndtr
 
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 
-__all__ = [
-    "EdgeFit",
-    "EdgeModel",
-    "StepFit",
-    "choose_width",
-    "find_unchanged_width",
-    "fit_blocks",
-    "fit_edges",
-    "fit_step",
-]
-
-
 # Gauss-Newton steps. The first one finds the grey levels only; each later one moves the edge by at
 # most half the reach, so that two can bring it anywhere within reach and two more settle it.
 _STEPS = 5

@@ -29,9 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Strip", "find_strip"]
-
-
 # Larger images are reduced to this size before they are searched.
 _SEARCHED_PX = 640
 # All directions are searched in an image of at most this size.

@@ -26,8 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Repeatability", "compare_series", "describe_disagreement", "group_frames"]
-
 # Spread over what the sigmas predict from which a note says so: of three magnifications, chance makes one in 500 exceed
 # it even if the errors of all poses are the same.
 _LARGE_SPREAD = 2.5

@@ -59,9 +59,6 @@ from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted, omit_numbers
 
-__all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
-
-
 # Range of an edge's step over that in the reference within which it counts as the same edge.
 _SAME_STEP = (0.5, 1.6)
 # What makers of cantilevers state of the length, as a fraction of it. A larger difference is told. As a uniform

@@ -34,8 +34,6 @@ from scipy.spatial import KDTree
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_blocks
 from semcal_ros.core.arrays import Array, mad_sigma
 
-__all__ = ["ROUGH_APEX_PX", "TipFit", "find_apex", "fit_tip"]
-
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
 

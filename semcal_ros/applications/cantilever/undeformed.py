@@ -33,8 +33,6 @@ from semcal_ros.applications.cantilever.tip import ROUGH_APEX_PX, fit_tip
 from semcal_ros.core.arrays import Array, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["REACH_PX", "PixelSamples", "UndeformedBeam", "fit_base_edge", "measure_undeformed_beam"]
-
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
 

@@ -36,9 +36,6 @@ from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from
 from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["Adjustment", "adjust"]
-
-
 _ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
 _LEAST_SCALE = 1e-6  # least scale of the residuals, for observations without errors
 _POINT_SPREAD = 3.0  # prior 1-sigma of the points' heights, in units of their spread

@@ -41,15 +41,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Image, Indices, mad_sigma
 
-__all__ = [
-    "Appearance",
-    "Shading",
-    "compute_log_grey",
-    "convert_for_tracking",
-    "fit_shading",
-    "prepare_appearance",
-]
-
 # Second difference along both axes. Its squares sum to 1, so that it keeps the sigma of the noise.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
 # Degree of the polynomial in X and Y of the normal: a cosine and its square, seen from any side, and shadows

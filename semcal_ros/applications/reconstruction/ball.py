@@ -42,9 +42,6 @@ from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.roundness import Roundness, measure_roundness
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 
-__all__ = ["Ball", "measure_ball"]
-
-
 # The jackknife has few degrees of freedom: a larger scatter than this happens by chance once in 20 times.
 _CHANCE = 0.05
 # 1-sigma of what patches are systematically off at the limb, px: with the true poses, the movement of a ball of

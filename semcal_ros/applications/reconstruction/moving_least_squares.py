@@ -30,9 +30,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["LocalSurface", "compute_spacing_m", "fit_local_surface"]
-
-
 # Neighbours in a fit, at most: eight for each coefficient of a quadric; bounds time and memory.
 _NEIGHBOURS = 48
 # A quadric has six coefficients; two more show the scatter.

@@ -37,16 +37,6 @@ from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
 
-__all__ = [
-    "WINDOW",
-    "PatchSettings",
-    "PosedSurface",
-    "Starmap",
-    "compute_displacement_m",
-    "measure_patches",
-    "project_to_plane_at_centre",
-]
-
 #: As :func:`itertools.starmap`.
 Starmap = Callable[[Callable[..., Any], Iterable[Sequence[Any]]], Iterator[Any]]
 

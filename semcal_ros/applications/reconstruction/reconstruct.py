@@ -51,8 +51,6 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Structure", "StructureSettings", "collect_tracks", "mirror_poses", "reconstruct"]
-
 
 @dataclass(frozen=True)
 class StructureSettings:

@@ -33,8 +33,6 @@ from semcal_ros.applications.reconstruction.tilt_pair import (
 from semcal_ros.core.arrays import AnyImage, Array, check_positive, mad_sigma
 from semcal_ros.core.errors import InvalidValueError, StructureError
 
-__all__ = ["HeightMap", "measure_heights"]
-
 # Least tilt between two pictures: at 0.5 degrees an error of 0.1 px is one of 11 px in height.
 _LEAST_TILT_RAD = np.radians(0.5)
 # Largest one: beyond it, pictures of rough surfaces hide too much of each other.

@@ -36,8 +36,6 @@ from numpy.typing import ArrayLike, NDArray
 from semcal_ros.applications.servoing.target import NestedTarget, dictionary
 from semcal_ros.core.arrays import Array, Image, Mask, check_image
 
-__all__ = ["RefinedQuads", "TargetView", "find_target", "refine_quads"]
-
 # Larger images are averaged down by a whole factor to find the markers; their sides are then
 # measured at full resolution.
 _SEARCHED_PX = 1024

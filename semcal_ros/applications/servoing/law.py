@@ -47,9 +47,6 @@ from semcal_ros.applications.servoing.settings import ServoSettings
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError, Rejection
 
-__all__ = ["Servo", "ServoStatus", "ServoStep"]
-
-
 # Largest part of the error that is removed per frame. With the latency predicted, up to 2 is
 # stable; without prediction 0.5 is still stable for a latency of two frames, whose limit is 0.618.
 _MOST_PER_FRAME = 0.5

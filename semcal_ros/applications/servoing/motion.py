@@ -24,9 +24,6 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["CommandHistory", "DisturbanceObserver", "StageMonitor"]
-
-
 # Commands that are kept: those of 30 s, the longest latency that is predicted, at 34 a second.
 _KEPT = 1024
 # Deviations (sigma) beyond which an innovation is not drift, and how many of them in a row are

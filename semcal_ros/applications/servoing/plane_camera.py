@@ -26,9 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PlaneCamera", "choose_projection"]
-
-
 # Relative difference of two matrices from the same numbers, one divided and multiplied by rho
 # again.
 _SAME = 1e-9

@@ -28,9 +28,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PlanePose", "PoseFit", "compute_interaction_matrix", "fit_pose"]
-
-
 # Gauss-Newton steps, at most: from the similarity they converge quadratically or not at all.
 _MOST_STEPS = 12
 # Movement of the corners in the last step, px: far below their errors.

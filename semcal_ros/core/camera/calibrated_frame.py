@@ -26,13 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "CalibratedFrame",
-    "Positions",
-    "describe_missing_camera",
-    "rectified_projection",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Positions:

@@ -22,14 +22,6 @@ from dataclasses import dataclass
 
 from semcal_ros.core.wording import printable
 
-__all__ = [
-    "FILE_NAMES",
-    "ConditionDifference",
-    "compare_conditions",
-    "describe_condition",
-    "format_time",
-]
-
 FILE_NAMES: Mapping[str, str] = {
     "accelerating_voltage_v": "acceleration_voltage_v",
     "serial": "serial_number",

@@ -30,9 +30,6 @@ from numpy.polynomial import legendre
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["KINDS", "ContinuousFunction", "basis_row"]
-
-
 KINDS = ("chebyshev_log", "chebyshev", "legendre", "linear_log", "ode")
 
 

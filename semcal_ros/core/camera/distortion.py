@@ -35,9 +35,6 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
 
-__all__ = ["Undistortion", "distort_jacobians", "distort_normalised", "undistort_normalised"]
-
-
 # Newton's method converges quadratically from the closed inverse of the radial part; a point that
 # needs more steps lies at a fold of the map.
 _MAX_ITERATIONS = 50

@@ -30,8 +30,6 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["KnownPixelSize", "make_nominal_calibration"]
-
 # Two sizes for one magnification contradict beyond so many of their joint sigmas.
 _CONTRADICTION = 3.0
 

@@ -33,8 +33,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["COEFFICIENTS", "PinholeModel", "fit_pinhole"]
-
 #: Names of the distortion coefficients, in the order of OpenCV.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # Power of r that a coefficient multiplies.

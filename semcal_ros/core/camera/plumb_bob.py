@@ -25,8 +25,6 @@ from scipy.spatial.transform import Rotation
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["PlumbBobCamera", "fit_plumb_bob"]
-
 # Points of the grid along each side: ten for each of the nine unknowns.
 _POINTS = 10
 

@@ -41,16 +41,6 @@ from semcal_ros.core.camera.scan_distortion import (
     raw_from_deflection,
 )
 
-__all__ = [
-    "ALL_NAMES",
-    "PARAMETER_NAMES",
-    "ProjectionJacobians",
-    "project_ideal_points",
-    "project_points",
-    "project_points_with_jacobians",
-]
-
-
 PARAMETER_NAMES: tuple[str, ...] = (
     "m",
     "aspect",

@@ -43,8 +43,6 @@ from semcal_ros.core.errors import InvalidValueError
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
-__all__ = ["FieldSlice", "ResidualField", "zero_field"]
-
 
 # Cubic splines: the field has two continuous derivatives.
 _DEGREE = 3

@@ -46,8 +46,6 @@ from semcal_ros.core.camera.scan_distortion import (
 )
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["RectifiedCamera", "ScanCamera", "as_points"]
-
 # Parameters that grow with the number of pixels of an image.
 _IN_PX = ("m", "px", "py", "ex", "ey")
 

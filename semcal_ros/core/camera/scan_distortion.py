@@ -43,20 +43,6 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 
-__all__ = [
-    "ALONG_COUNT",
-    "SCAN_NAMES",
-    "SETTLING",
-    "SETTLING_TIMES",
-    "Raster",
-    "ScanDerivatives",
-    "deflection_shift",
-    "deflection_stretch",
-    "linearise_scan",
-    "raw_from_deflection",
-    "scan_functions",
-]
-
 SETTLING_TIMES: tuple[float, ...] = (0.0117, 0.0234, 0.0469, 0.0938, 0.1875)
 """Time constants of the settling, in half lines: 3, 6, 12, 24 and 48 columns of 512."""
 SCAN_NAMES: tuple[str, ...] = (

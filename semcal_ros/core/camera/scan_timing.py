@@ -36,9 +36,6 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["ScanTiming"]
-
-
 # Eleven days: what is longer has lost its unit.
 _LONGEST_S = 1e6
 

@@ -30,16 +30,6 @@ from semcal_ros.core.camera.scan_distortion import (
     deflection_shift,
 )
 
-__all__ = [
-    "TERM_KINDS",
-    "describe_term_sizes",
-    "displace_by",
-    "has_terms",
-    "largest_term_sizes",
-    "measure_along_axes",
-    "measure_terms",
-]
-
 TERM_KINDS: tuple[str, ...] = (
     "radial",
     "decentring",

@@ -30,14 +30,6 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import RectifiedCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "BudgetPart",
-    "UncertaintyBudget",
-    "budget_of_length",
-    "budget_of_pixel_size",
-    "worst_pixel_size",
-]
-
 #: Tilt of a specimen that is mounted flat, 1-sigma: half a degree, as in the priors of a calibration.
 _TILT_SIGMA_RAD = 0.0087
 _COVERAGE = 2.0

@@ -53,17 +53,6 @@ from semcal_ros.core.corners.thresholds import (
 )
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = [
-    "FittedCorners",
-    "contrast_signs",
-    "estimate_scatter_px",
-    "find_consistent",
-    "find_credible",
-    "find_undisturbed",
-    "inflate_variance",
-    "select_connected",
-]
-
 # By the number of dimensions.
 MEDIAN_SIGMA = {1: MEDIAN_SIGMA_1, 2: MEDIAN_SIGMA_2}
 

@@ -51,19 +51,6 @@ from semcal_ros.core.corners.window import PixelWindows
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = [
-    "CornerFit",
-    "NoiseModel",
-    "PositionFit",
-    "band_px",
-    "compare_opposite_squares",
-    "fit_corners",
-    "fit_noise",
-    "normal_equations",
-    "rough_start",
-    "split_statistics",
-]
-
 
 @dataclass(frozen=True)
 class NoiseModel:

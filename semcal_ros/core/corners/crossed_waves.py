@@ -47,8 +47,6 @@ from semcal_ros.core.corners.thresholds import (
     PERIODS_MIN,
 )
 
-__all__ = ["find_cells"]
-
 # The image with all grey levels, and with clipped ones, in which a hole weighs no more than the lines.
 _PREPARED: tuple[Callable[[Array32], Array32], ...] = (np.asarray, clip_levels)
 

@@ -65,16 +65,6 @@ from semcal_ros.core.corners.unit_cell import (
 )
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = [
-    "bright_cells",
-    "centre_cells",
-    "count_regular_area",
-    "fit_lattice_shapes",
-    "grow_at_scale",
-    "refine_cells",
-    "split_mixture",
-]
-
 
 def grow_at_scale(
     small: Image, scale_px: float, octave: int, size: tuple[int, int]

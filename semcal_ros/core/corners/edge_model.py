@@ -37,21 +37,6 @@ from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.corners.thresholds import ERF_C, ERF_P, NEIGHBOUR_BLURS
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = [
-    "ANGLES",
-    "BRIGHTNESS",
-    "CONTRAST",
-    "GRADIENTS",
-    "GROWTH",
-    "LINEAR",
-    "LOG_BLUR",
-    "NONLINEAR",
-    "SAGITTAS",
-    "EdgeGeometry",
-    "evaluate",
-]
-
-
 # The parameters of a corner in their order: position, directions of the two edges, logarithm of the blur, extra
 # sagittas over half a square; then those that act linearly, as above.
 _NONLINEAR = ("x", "y", "angle_1", "angle_2", "log_blur", "sagitta_1", "sagitta_2")

@@ -41,8 +41,6 @@ from semcal_ros.core.corners.thresholds import (
 )
 from semcal_ros.core.errors import Rejection
 
-__all__ = ["LineFit", "find_lines", "fit_lines"]
-
 
 @dataclass(frozen=True)
 class _Wave:

@@ -33,9 +33,6 @@ from semcal_ros.core.corners.thresholds import (
     SEEDS_TRIED,
 )
 
-__all__ = ["Lattice", "enlarged", "grow_best_lattice"]
-
-
 COSINE_MIN = float(np.cos(np.deg2rad(SADDLE_DIRECTION_MAX_DEG)))
 # From a cell to its four neighbours.
 STEPS: Indices = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])

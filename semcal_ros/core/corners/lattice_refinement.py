@@ -59,8 +59,6 @@ from semcal_ros.core.corners.thresholds import (
 )
 from semcal_ros.core.corners.window import gather_windows
 
-__all__ = ["RefinedCorners", "refine_lattice"]
-
 
 @dataclass(frozen=True)
 class RefinedCorners:

@@ -29,8 +29,6 @@ from semcal_ros.core.corners.thresholds import (
     THIRD_ORDER_RIDGE,
 )
 
-__all__ = ["LocalMaps", "fit_local_maps"]
-
 
 @dataclass(frozen=True)
 class LocalMaps:

@@ -37,8 +37,6 @@ from semcal_ros.core.corners.thresholds import (
     PHASE_PLACES_MAX,
 )
 
-__all__ = ["LocalPhase", "SmoothPhase", "follow_phase"]
-
 _POWERS = [(a, n - a) for n in range(1, PHASE_DEGREE + 1) for a in range(n + 1)]
 
 

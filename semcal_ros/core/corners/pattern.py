@@ -56,19 +56,6 @@ from semcal_ros.core.corners.thresholds import (
 from semcal_ros.core.corners.unit_cell import UnitCell
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "PATTERNS",
-    "PATTERN_NAMES",
-    "CellShape",
-    "CellShapes",
-    "Pattern",
-    "PatternChoice",
-    "check_pattern",
-    "describe_odds",
-    "find_motif",
-    "fit_shapes",
-]
-
 #: What a grid consists of.
 Pattern = Literal["chess", "dots", "crosses", "lines", "grating"]
 #: What to search for.

@@ -50,9 +50,6 @@ from semcal_ros.core.corners.thresholds import (
     SAGITTA_PRIOR_PX,
 )
 
-__all__ = ["Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
-
-
 PARAMETERS = NONLINEAR + LINEAR
 # Parameters that share one spread.
 GROUPS = (ANGLES, slice(LOG_BLUR, LOG_BLUR + 1), SAGITTAS, *GRADIENTS, GROWTH)

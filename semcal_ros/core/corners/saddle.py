@@ -34,8 +34,6 @@ from semcal_ros.core.corners.thresholds import (
 )
 from semcal_ros.core.errors import InvalidValueError, Rejection
 
-__all__ = ["LatticeStatus", "SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
-
 
 class LatticeStatus(Enum):
     """Why an image gives no lattice."""

@@ -50,8 +50,6 @@ from semcal_ros.core.corners.thresholds import (
     WINDOW_LOBE_BINS,
 )
 
-__all__ = ["Spectrum", "clip_levels", "compute_spectrum", "list_octaves"]
-
 
 @dataclass(frozen=True)
 class Spectrum:

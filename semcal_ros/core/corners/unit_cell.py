@@ -54,8 +54,6 @@ from semcal_ros.core.corners.thresholds import (
 )
 from semcal_ros.core.corners.window import PixelWindows, gather_windows
 
-__all__ = ["CellFit", "UnitCell", "average_cells", "bin_cells", "fit_cells", "gather_cells"]
-
 
 @dataclass(frozen=True)
 class UnitCell:

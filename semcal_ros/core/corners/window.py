@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array, Array32, Mask
 from semcal_ros.core.corners.thresholds import WINDOW_BLOCK_PIXELS, WINDOW_HALF_WIDTH
 
-__all__ = ["PixelWindows", "gather_windows"]
-
 
 @dataclass(frozen=True)
 class PixelWindows:

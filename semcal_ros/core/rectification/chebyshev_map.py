@@ -41,8 +41,6 @@ from semcal_ros.core.rectification.raw_positions import (
     raw_from_output,
 )
 
-__all__ = ["RawMap", "SmoothMaps"]
-
 # Test points along each axis, which lie where none of the degrees has a node.
 _TESTS, _TEST_OFFSET = 9, 0.37
 _DEGREES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)

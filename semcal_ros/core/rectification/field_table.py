@@ -35,8 +35,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["FieldTable", "tabulate_field"]
-
 # Half a pixel along the lines, where the beam settles. Down the image the knots of the field are a quarter of its
 # height apart, so that a step of a few rows does: two at 512. The error is as the square of the step times the second
 # derivative, which for the same field falls with the height.

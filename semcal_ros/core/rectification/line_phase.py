@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Array32
 
-__all__ = ["LinePhase", "LinePhaseCorrector", "estimate_line_phase", "remove_line_phase"]
-
 # Largest phase that is looked for, part of the width: lags are some microseconds, and lines take a millisecond.
 _LARGEST = 1.0 / 16.0
 # Lines that are compared with their neighbours, up to twice as many: they tell the phase of gold at 30 electrons to

@@ -37,18 +37,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "PixelDrift",
-    "RasterDrift",
-    "camera_key",
-    "check_drift",
-    "drift_key",
-    "raw_from_output",
-    "rotation_centre",
-    "similarity_matrix",
-]
-
-
 # Each step shrinks the error by the drift per row time over a row: a drift of half a row per row
 # takes 20 steps, one that needs more than 50 is too fast for the raster.
 _MAX_STEPS = 50

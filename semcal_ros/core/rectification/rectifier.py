@@ -44,9 +44,6 @@ from semcal_ros.core.rectification.raw_positions import (
     drift_key,
 )
 
-__all__ = ["Rectifier"]
-
-
 _INTERPOLATIONS = {
     "linear": cv2.INTER_LINEAR,
     "cubic": cv2.INTER_CUBIC,

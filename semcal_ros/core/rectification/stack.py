@@ -35,9 +35,6 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
 
-__all__ = ["Stack", "StackSums", "StackedImage", "find_scanned"]
-
-
 # Rows or columns that an interpolation takes beyond the two nearest ones.
 _REACH_PX = {"linear": 0, "cubic": 1, "lanczos4": 3}
 # As accurate as the maps are; a pixel at the edge must not drop out by rounding.

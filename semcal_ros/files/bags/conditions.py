@@ -32,8 +32,6 @@ from semcal_ros.files.bags.reader import BagReader
 from semcal_ros.files.bags.topics import topic_matches
 from semcal_ros.files.tiff.sem_image import Conditions
 
-__all__ = ["CONDITIONS_TOPIC", "ConditionsTrack", "find_conditions"]
-
 CONDITIONS_TOPIC = "conditions"
 """Topic with what the microscope says of the conditions (diagnostic_msgs/DiagnosticStatus)."""
 

@@ -26,8 +26,6 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.bags.reader import BagReader, RawMessage
 
-__all__ = ["HeldValues", "MagnificationTrack"]
-
 T = TypeVar("T")
 
 

@@ -32,18 +32,6 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.tiff.sem_image import Conditions
 
-__all__ = [
-    "blank_message",
-    "check_recordable",
-    "conditions_message",
-    "jazzy_types",
-    "magnification_message",
-    "message_type_name",
-    "microscope_topic",
-    "serialize_message",
-    "stage_message",
-]
-
 _NOT_NUMERIC = ("string", "wstring")
 _NUMPY_NAMES = {"byte": "uint8", "char": "uint8", "bool": "bool"}
 _NUMBER_TYPES = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")

@@ -51,14 +51,6 @@ from semcal_ros.text_files import name_similar_file, read_text_file
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = [
-    "BagMessage",
-    "BagReader",
-    "BagTopic",
-    "RawMessage",
-    "is_bag",
-    "open_bag",
-]
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _ACCEPTED = "a rosbag2 folder with metadata.yaml, or one .mcap or .db3 file"

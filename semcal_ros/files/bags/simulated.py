@@ -31,8 +31,6 @@ from semcal_ros.config.config import STAGE_TYPE
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 
-__all__ = ["SIMULATED_START_NS", "write_simulated"]
-
 SIMULATED_START_NS = 1_700_000_000_000_000_000
 """Stamp of time zero, ns: arbitrary but fixed, which keeps recordings of one seed identical."""
 

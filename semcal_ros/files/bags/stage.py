@@ -33,8 +33,6 @@ from semcal_ros.files.bags.held_values import HeldValues
 from semcal_ros.files.bags.reader import BagReader, BagTopic
 from semcal_ros.files.bags.topics import topic_matches
 
-__all__ = ["StageTrack", "find_stage"]
-
 _UNUSED = "the stage is not used"
 
 

@@ -44,8 +44,6 @@ from semcal_ros.files.tiff.sem_image import Conditions
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["ViewRecorder"]
-
 
 class ViewRecorder:
     """Context manager; the bag appears when the block ends without an error, as that of :class:`BagWriter`.

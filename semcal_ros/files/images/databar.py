@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import without_databar
 
-__all__ = ["DatabarCutter", "DatabarFinder", "find_databar"]
-
 # Part of a row that has its commonest value: in bars at least a half, but where text is dense; in pictures of 8 bits at
 # most a third, but where they are clipped.
 _OF_BAR, _OF_BAR_TYPICALLY, _OF_PICTURE = 0.45, 0.6, 0.4

@@ -43,16 +43,6 @@ from semcal_ros.files.tiff.read import (
 from semcal_ros.files.tiff.sem_image import VendorSettings
 from semcal_ros.files.video import VIDEO_SUFFIXES, describe_video, read_video
 
-__all__ = [
-    "PLAIN_IMAGES",
-    "ImageFile",
-    "ImagePage",
-    "describe_image_file",
-    "describe_plain_image",
-    "is_image_file",
-    "read_plain_image",
-]
-
 #: Suffixes of these files.
 PLAIN_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp"})
 

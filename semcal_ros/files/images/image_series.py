@@ -47,17 +47,6 @@ from semcal_ros.files.tiff.same_scan import group_by_scan
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.text_files import name_similar_file
 
-__all__ = [
-    "MIN_SPACING_NS",
-    "ImageSeries",
-    "SeriesImage",
-    "Skipped",
-    "find_image_files",
-    "group_skipped",
-    "list_image_series",
-    "refuse_images",
-]
-
 _SECOND_NS = 1_000_000_000
 _SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
 MIN_SPACING_NS = 1_000_000

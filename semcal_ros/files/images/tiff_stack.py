@@ -36,8 +36,6 @@ from semcal_ros.files.tiff.read import open_tiff
 from semcal_ros.files.tiff.values import quantity
 from semcal_ros.files.tiff.xml_tag import parse_xml
 
-__all__ = ["TiffStack", "list_tiff_stack", "read_tiff_stack"]
-
 _MAX_PAGES = 100_000
 _MAX_BYTES = 8
 _GREY = ("minisblack", "miniswhite", "rgb", "palette", "ycbcr")

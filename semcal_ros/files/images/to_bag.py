@@ -56,8 +56,6 @@ from semcal_ros.files.images.image_series import (
 from semcal_ros.files.recordings import ENCODINGS, RecordedFiles, open_image_series
 from semcal_ros.files.tiff.sem_image import Conditions, SemImage
 
-__all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_images"]
-
 METADATA_TOPIC = "metadata"
 """Topic with the settings of each image as JSON text (std_msgs/String)."""
 

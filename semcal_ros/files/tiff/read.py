@@ -51,16 +51,6 @@ from semcal_ros.files.tiff.pixels import check_directories, grey_image, page_siz
 from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
 from semcal_ros.files.tiff.side_file import decode_text, find_side_file, read_side_file
 
-__all__ = [
-    "is_tiff",
-    "open_tiff",
-    "read_page_settings",
-    "read_sem_pages",
-    "read_sem_settings",
-    "read_sem_tiff",
-    "side_file_settings",
-]
-
 SUFFIXES = (".tif", ".tiff")
 # Bounds what a damaged chain of directories can request; a series of this length fills a day at 1 Hz.
 _MAX_PAGES = 100_000

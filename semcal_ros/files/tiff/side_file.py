@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["decode_text", "find_side_file", "read_side_file"]
-
 _MAX_BYTES = 1_000_000  # the text files have a few kB
 
 

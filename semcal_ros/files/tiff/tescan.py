@@ -35,8 +35,6 @@ from semcal_ros.files.tiff.values import (
     tilt_correction_note,
 )
 
-__all__ = ["TAG", "tescan_pairs", "tescan_settings"]
-
 # TESCAN's private TIFF tag.
 TAG = 50431
 _LENGTH_BYTES, _TYPE_BYTES = 4, 2

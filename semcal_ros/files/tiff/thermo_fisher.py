@@ -39,14 +39,6 @@ from semcal_ros.files.tiff.values import (
 )
 from semcal_ros.files.tiff.xml_tag import date_of, number_of, quantity_of, text_of
 
-__all__ = [
-    "ROOT",
-    "TAGS",
-    "thermo_fisher_sections",
-    "thermo_fisher_settings",
-    "thermo_fisher_xml_settings",
-]
-
 # Private TIFF tags of FEI, now Thermo Fisher: FEI_HELIOS and FEI_SFEG.
 TAGS = (34682, 34680)
 ROOT = "Metadata"

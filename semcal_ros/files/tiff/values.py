@@ -23,21 +23,6 @@ from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
 
-__all__ = [
-    "PIXEL_SIZE_RANGE_M",
-    "angle_in_degrees",
-    "aspect_notes",
-    "check_pixel_size",
-    "duration",
-    "first_date",
-    "is_credible_year",
-    "plain_number",
-    "positive",
-    "quantity",
-    "rounding",
-    "tilt_correction_note",
-]
-
 # A tenth of a picometre lies far below the size of an atom, a millimetre above any field of an SEM
 # divided by its columns: what lies outside has lost its unit.
 PIXEL_SIZE_RANGE_M = (1e-13, 1e-3)

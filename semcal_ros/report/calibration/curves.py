@@ -29,17 +29,6 @@ from semcal_ros.report.html.encode import Readings
 from semcal_ros.report.html.style import INK, SECOND
 from semcal_ros.report.html.text import format_magnification
 
-__all__ = [
-    "draw_curve",
-    "mark_magnifications",
-    "parts_by_specimen",
-    "read_curve",
-    "sample_cameras",
-    "sample_cameras_around",
-    "set_limits_with_room",
-]
-
-
 # Points of a curve: closer together than a line of the figure bends.
 _SAMPLES = 81
 

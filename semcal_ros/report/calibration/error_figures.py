@@ -55,15 +55,6 @@ from semcal_ros.report.html.style import (
 )
 from semcal_ros.report.html.text import format_length, format_magnification, format_px
 
-__all__ = [
-    "plot_distortion",
-    "plot_mean_residuals",
-    "plot_residual_field",
-    "plot_residual_histogram",
-    "plot_residuals",
-    "plot_rms",
-]
-
 # Ends of the histogram, in sigma; what lies beyond is counted in the last bins.
 _HISTOGRAM_LIMIT = 5.0
 # Cells across the field for mean residuals: large enough to hold many corners each.

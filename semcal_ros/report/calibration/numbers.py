@@ -45,20 +45,6 @@ from semcal_ros.report.html.text import (
     remove_control_characters,
 )
 
-__all__ = [
-    "PAPER_RMS_PX",
-    "MagnificationRow",
-    "PaperRow",
-    "collect_facts",
-    "collect_warnings",
-    "compute_fitted_inner_px",
-    "compute_held_out_px",
-    "compute_median_px",
-    "tabulate_beside_paper",
-    "tabulate_cameras",
-    "tabulate_magnifications",
-]
-
 # Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: 0.9 in the abstract, 1.45 in section 4.1.3.
 PAPER_RMS_PX = (0.9, 1.45)
 

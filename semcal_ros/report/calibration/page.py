@@ -75,8 +75,6 @@ from semcal_ros.report.html.encode import encode_pictures
 from semcal_ros.report.html.page import render, write_page
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
-__all__ = ["suggest_commands", "write_calibration_report"]
-
 # Example images on a page, at most: they make most of its size.
 _MAX_OVERLAYS = 24
 # Examples that are visible at once; the others unfold.

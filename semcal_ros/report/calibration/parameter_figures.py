@@ -45,14 +45,6 @@ from semcal_ros.report.html.style import (
 )
 from semcal_ros.report.html.text import format_length, format_with_sigma
 
-__all__ = [
-    "ParameterGroup",
-    "compute_focal_length_px",
-    "plot_calibration",
-    "plot_parameters",
-    "plot_pixel_sizes",
-]
-
 
 @dataclass(frozen=True)
 class ParameterGroup:

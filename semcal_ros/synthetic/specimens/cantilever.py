@@ -40,19 +40,6 @@ from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.substrate import Substrate
 
-__all__ = [
-    "CANTILEVER_MAGNIFICATIONS",
-    "CANTILEVER_PUSHES",
-    "SQUARE_TIP",
-    "BeamTip",
-    "CantileverFrame",
-    "CantileverPlan",
-    "CantileverScene",
-    "Charging",
-    "cantilever_plan",
-]
-
-
 CANTILEVER_MAGNIFICATIONS: tuple[float, ...] = (6450.0, 7760.0, 8890.0)
 """Those of Malti et al. (2012), section 4.3."""
 

@@ -26,18 +26,6 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "SQUARES_M",
-    "TYPICAL_GRID",
-    "ChessGrid",
-    "FlatSpecimen",
-    "GridFaults",
-    "Specimen",
-    "UnevenSpecimen",
-    "square_for",
-]
-
-
 SQUARES_M: tuple[float, ...] = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 """Square sizes of the multi-scale grid."""
 

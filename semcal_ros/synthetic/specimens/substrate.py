@@ -32,8 +32,6 @@ from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
 
-__all__ = ["SUBSTRATES", "Substrate", "SubstrateKind"]
-
 SubstrateKind = Literal["grains", "islands", "fibres", "scratches", "smooth"]
 
 #: The kinds of substrate.

@@ -28,9 +28,6 @@ from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.cantilever import NO_CHARGING, Charging
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
 
-__all__ = ["TargetSpecimen", "random_target"]
-
-
 # Texels per cell: seven for each square of a marker, and nine for the white on either side.
 _TEXELS_PER_BIT = 7
 _CELL = round(MARKER_BITS * _TEXELS_PER_BIT / SIDE)
