@@ -61,7 +61,7 @@ _STEP_S = 0.05
 # Messages that may wait while others are handled. Chosen, not measured.
 _DEPTH = 50
 # As many images as tell whether they have a data bar.
-_LOOKED_AT = 2
+_KEPT_IMAGES = 2
 _PARAMETERS = ("use_sim_time", "config")
 
 
@@ -112,7 +112,7 @@ class _Observer:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._arrivals: dict[str, list[Arrival]] = {}
-        self._images: deque[Any] = deque(maxlen=_LOOKED_AT)
+        self._images: deque[Any] = deque(maxlen=_KEPT_IMAGES)
         self._magnification: Any = None
         self._stage: Any = None
         self._conditions: dict[str, float | str] | None = None

@@ -94,9 +94,9 @@ def _segment_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
 
 
 def _malloc_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
-    own = "glibc.malloc" in environment.get("GLIBC_TUNABLES", "")
+    tuned = "glibc.malloc" in environment.get("GLIBC_TUNABLES", "")
     other = _OTHER_MALLOC.search(environment.get("LD_PRELOAD", ""))
-    if image_bytes < _MALLOC_MATTERS_BYTES or own or other or not _has_glibc():
+    if image_bytes < _MALLOC_MATTERS_BYTES or tuned or other or not _has_glibc():
         return ""
     small = [name for name in MALLOC_VARIABLES if _number(environment.get(name)) < image_bytes]
     if not small:

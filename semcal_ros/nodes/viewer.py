@@ -452,9 +452,9 @@ class Viewer(SemNode):
         offer("start", [f"{node}/{verb}" for node in sources for verb in ("start", "resume")])
         offer("stop", [f"{node}/{verb}" for node in sources for verb in ("stop", "pause")])
         offer("reset", [f"{node}/reset" for node in self._images.publishers("corrected")])
-        own = self.get_namespace().rstrip("/")
+        namespace = self.get_namespace().rstrip("/")
         for action, service in _CALIBRATION_ACTIONS.items():
-            offer(action, [f"{own}/{_SERVER}/{service}"])
+            offer(action, [f"{namespace}/{_SERVER}/{service}"])
         self._offered = found
 
     # -- what the page shows -----------------------------------------------------------------------------

@@ -47,7 +47,7 @@ _LARGEST_WIDTH_PX = 4096
 
 
 @dataclass(frozen=True)
-class ViewRequest:
+class PageRequest:
     """What a page wants to see.
 
     Attributes
@@ -95,7 +95,7 @@ def _pair(value: Any, name: str) -> tuple[float, float]:
     return _number(value[0], name), _number(value[1], name)
 
 
-def read_view_request(message: dict[str, Any], before: ViewRequest) -> ViewRequest:
+def read_page_request(message: dict[str, Any], before: PageRequest) -> PageRequest:
     """Read what a page wants; what the message leaves out stays as before.
 
     Raises
@@ -149,7 +149,7 @@ def _scale(view: View, width_px: int) -> dict[str, object] | None:
     }
 
 
-def encode_view(view: View, request: ViewRequest, *, age_s: float | None = None) -> bytes:
+def encode_view(view: View, request: PageRequest, *, age_s: float | None = None) -> bytes:
     """Encode a frame as one message: a header in JSON, and its pictures as JPEG.
 
     All pictures are stretched by the levels of the first one, so that they can be compared.

@@ -39,12 +39,12 @@ from tornado import httpserver, web, websocket
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.images.write import PixelScale, pixel_scale, write_image
 from semcal_ros.viewer.messages import (
-    ViewRequest,
+    PageRequest,
     encode_overlay,
     encode_view,
     measure,
+    read_page_request,
     read_value,
-    read_view_request,
 )
 from semcal_ros.viewer.source import ACTIONS, View, ViewSource
 
@@ -334,7 +334,7 @@ class _Live(websocket.WebSocketHandler):
 
     def initialize(self, server: PageServer) -> None:
         self._server = server
-        self._request = ViewRequest()
+        self._request = PageRequest()
         self._changed = True
         self._sent = self._overlay = -1
         self._waits_since_s: float | None = None
@@ -431,7 +431,7 @@ class _Live(websocket.WebSocketHandler):
         if kind == "seen":
             self._waits_since_s = None
         elif kind == "request":
-            self._request = read_view_request(request, self._request)
+            self._request = read_page_request(request, self._request)
             self._changed = True
         elif kind == "measure":
             view = self._server.source.newest()
