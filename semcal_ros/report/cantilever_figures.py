@@ -64,6 +64,8 @@ _SHOWN_PX = 128
 # Quantiles of the grey levels that a video shows as black and white: one pixel in a thousand may be
 # clipped at either end.
 _BLACK_WHITE = (0.001, 0.999)
+# OpenCV draws at sixteenths of a pixel.
+_FRACTION_BITS = 4
 
 
 def write_poses_figure(agreed: Repeatability, file: Path) -> None:
@@ -266,10 +268,6 @@ def _draw_frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: 
     nm, sigma = 1e9 * found.deflection_m, 1e9 * found.sigma_m
     title = f"{one.magnification:g}×, pose {pose + 1}: {nm:.1f} ± {sigma:.1f} nm"
     axes.set_title(title, fontsize=7, color=INK)
-
-
-# OpenCV draws at sixteenths of a pixel.
-_FRACTION_BITS = 4
 
 
 def draw_deflection(

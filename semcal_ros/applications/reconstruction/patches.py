@@ -39,6 +39,14 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 
 #: As :func:`itertools.starmap`.
 Starmap = Callable[[Callable[..., Any], Iterable[Sequence[Any]]], Iterator[Any]]
+WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
+# Least contrast of a patch over that of the template. It keeps the division bounded for patches
+# that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
+_GAIN_LEAST = 0.3
+# Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
+_SHADING_POINTS = 100
+# Points whose patches are compared together: of 150 views some 9 MB, a fraction of a second.
+_POINTS_AT_ONCE = 64
 
 
 def compute_displacement_m(
@@ -59,16 +67,6 @@ def project_to_plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, ra
     """Project raw pixels (n, 2) to sem-frame X, Y (n, 2) in m at the centre of the acquisition."""
     seen = project_to_plane(frame.camera, raw)
     return seen - compute_displacement_m(frame, scan, raw, seen)
-
-
-WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
-# Least contrast of a patch over that of the template. It keeps the division bounded for patches
-# that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
-_GAIN_LEAST = 0.3
-# Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
-_SHADING_POINTS = 100
-# Points whose patches are compared together: of 150 views some 9 MB, a fraction of a second.
-_POINTS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)

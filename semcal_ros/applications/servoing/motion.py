@@ -31,6 +31,10 @@ _KEPT = 1024
 _GATE, _ODD = 5.0, 4
 # Factor on the expected drift in that case.
 _WIDER = 10.0
+# Commanded travel after which the stage is judged: well above drift and noise in that time.
+_JUDGED_PX = 36.0
+# Least and largest part of the commanded travel that must be seen.
+_LEAST, _MOST = 0.3, 3.0
 
 
 class CommandHistory:
@@ -119,12 +123,6 @@ class DisturbanceObserver:
         gain = self.variance / spread
         self.velocity_m_s = self.velocity_m_s + gain * surprise
         self.variance = (1.0 - gain) * self.variance
-
-
-# Commanded travel after which the stage is judged: well above drift and noise in that time.
-_JUDGED_PX = 36.0
-# Least and largest part of the commanded travel that must be seen.
-_LEAST, _MOST = 0.3, 3.0
 
 
 class StageMonitor:

@@ -55,6 +55,8 @@ MIN_SPACING_NS = 1_000_000
 _SAME_SCALE = 5e-3
 # Files in which a bar of text is looked for.
 _EXAMINED = 3
+# A stage that turns back comes back to a fraction of this, rad.
+_TURNED_RAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -332,10 +334,6 @@ def _in_time(files: Sequence[ImageFile], begins: Sequence[int | None]) -> list[I
         return list(files)
     order = sorted(range(len(files)), key=lambda k: begins[k] or 0)
     return [files[k] for k in order]
-
-
-# A stage that turns back comes back to a fraction of this, rad.
-_TURNED_RAD = 1e-3
 
 
 def _stages(found: Sequence[_Image]) -> tuple[list[StageReading | None], list[str]]:

@@ -49,7 +49,7 @@ from semcal_ros.files.tiff.imagej import (
 )
 from semcal_ros.files.tiff.pixels import check_directories, grey_image, page_size
 from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
-from semcal_ros.files.tiff.side_file import decode_text, find_side_file, read_side_file
+from semcal_ros.files.tiff.values import decode_text, find_side_file, read_side_file
 
 SUFFIXES = (".tif", ".tiff")
 # Bounds what a damaged chain of directories can request; a series of this length fills a day at 1 Hz.
