@@ -12,11 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The numbers of the search for corners: all in one table, and those that are said to follow from something do."""
+"""The numbers of the search for corners: those that are said to follow from something do."""
 
 from __future__ import annotations
-
-import ast
 
 import numpy as np
 import pytest
@@ -24,45 +22,6 @@ from scipy import special, stats
 
 from semcal_ros.core.corners import thresholds as t
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.thresholds import Source, Table
-from tests.helpers.project import ROOT, load_script
-
-ROOM = ROOT / "semcal_ros" / "core" / "corners"
-
-
-def test_no_number_of_the_room_stands_elsewhere() -> None:
-    house = load_script("house")
-    modules = house.read_modules(ROOT, "core/corners")
-    named = {m.path: [name for name, _, _ in house.find_constants(m)] for m in modules}
-    assert len(named.pop("core/corners/thresholds.py")) == len(list(t.TABLE)) > 100
-    # From a cell to its four neighbours: geometry, and nothing that could be otherwise.
-    assert {p: names for p, names in named.items() if names} == {
-        "core/corners/lattice.py": ["STEPS"]
-    }
-
-
-def test_every_number_is_used_and_has_a_unit_and_a_source() -> None:
-    used = {
-        node.id
-        for path in ROOM.glob("*.py")
-        if path.stem != "thresholds"
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Name)
-    }
-    for row in t.TABLE:
-        assert getattr(t, row.name) is row.value
-        assert row.unit and row.text.endswith("."), row
-        assert row.name in used, row
-
-
-def test_a_name_stands_once_and_a_command_with_what_it_shows() -> None:
-    table = Table()
-    assert table.measured("A", 2.5, "px", "Seen at most", command="python -m this") == 2.5
-    (row,) = table
-    assert row.source is Source.MEASURED and row.text == "Seen at most (python -m this)"
-    with pytest.raises(InvalidValueError, match="two thresholds A"):
-        table.stated("A", 3, "px", "Again.")
 
 
 @pytest.mark.parametrize(
