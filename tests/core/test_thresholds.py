@@ -47,7 +47,7 @@ def test_no_number_of_the_room_stands_elsewhere(room: Path) -> None:
     modules = house.read_modules(ROOT, f"core/{room.name}")
     named = {m.path: {name for name, _, _ in house.find_constants(m)} for m in modules}
     rows = list(_table(room)[1])
-    assert len(named.pop(f"core/{room.name}/thresholds.py")) == len(rows) > 40
+    assert len(named.pop(f"core/{room.name}/thresholds.py")) == len(rows) > 20
     assert {p: names for p, names in named.items() if names - NO_THRESHOLDS} == {}
 
 

@@ -20,6 +20,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from semcal_ros.core.camera.thresholds import (
+    CONDITION_TOLERANCE,
+    DISTANCE_TOLERANCE,
+    ROTATION_TOLERANCE_RAD,
+    VOLTAGE_TOLERANCE,
+)
 from semcal_ros.core.wording import printable
 
 FILE_NAMES: Mapping[str, str] = {
@@ -27,17 +33,6 @@ FILE_NAMES: Mapping[str, str] = {
     "serial": "serial_number",
 }
 """What image and calibration files call conditions that have another name on the topic."""
-
-# High-voltage supplies are stable and read back to far less than 1 %, and lens fields that are focused again follow
-# the voltage: 1 % is neither reached by a reading's scatter nor does it change a magnification by more than that.
-_VOLTAGE_TOLERANCE = 0.01
-# A working distance follows each focusing: 1 % is 0.1 mm at 10 mm, less than the focus of a flat specimen scatters.
-_DISTANCE_TOLERANCE = 0.01
-# 0.5 degrees, the 1-sigma that the configuration assumes of a stage's rotation. An aspect ratio of 1 % that is turned
-# by so much becomes a skew of 2e-4.
-_ROTATION_TOLERANCE_RAD = 0.0087
-# Makers' programs round what they show: 1 % of a current or a time is no difference.
-_OTHER_TOLERANCE = 0.01
 
 
 def format_time(time_s: float) -> str:
@@ -199,11 +194,11 @@ def _differs(
         # The whole turn that brings it next to the middle of the range.
         middle = 0.5 * (low + high)
         number = middle + math.remainder(number - middle, 2.0 * math.pi)
-        return not low - _ROTATION_TOLERANCE_RAD <= number <= high + _ROTATION_TOLERANCE_RAD
+        return not low - ROTATION_TOLERANCE_RAD <= number <= high + ROTATION_TOLERANCE_RAD
     relative = {
-        "acceleration_voltage_v": _VOLTAGE_TOLERANCE,
-        "working_distance_m": _DISTANCE_TOLERANCE,
-    }.get(name, _OTHER_TOLERANCE)
+        "acceleration_voltage_v": VOLTAGE_TOLERANCE,
+        "working_distance_m": DISTANCE_TOLERANCE,
+    }.get(name, CONDITION_TOLERANCE)
     if name == "acceleration_voltage_v":
         # Some programs show the negative voltage of the cathode.
         low, high, number = (*sorted((abs(low), abs(high))), abs(number))

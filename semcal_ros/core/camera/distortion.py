@@ -34,12 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
-
-# Newton's method converges quadratically from the closed inverse of the radial part; a point that
-# needs more steps lies at a fold of the map.
-_MAX_ITERATIONS = 50
-# Half an ulp of a coordinate of order one: Newton cannot do better in double precision.
-_TOLERANCE = 1e-14
+from semcal_ros.core.camera.thresholds import LENS_STEPS_MAX, LENS_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -167,7 +162,7 @@ def undistort_normalised(
     done = np.zeros(len(q), dtype=bool)
     iterations = 0
     active = np.flatnonzero(branch)
-    while active.size and iterations < _MAX_ITERATIONS:
+    while active.size and iterations < LENS_STEPS_MAX:
         iterations += 1
         f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s, xi_u)
         residual = q_d[active] - f
@@ -185,7 +180,7 @@ def undistort_normalised(
         error[active] = np.hypot(residual[:, 0], residual[:, 1])
         q[active] = q[active] + step
         size = np.hypot(step[:, 0], step[:, 1])
-        reached = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
+        reached = good & (size <= LENS_TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
         done[active[reached]] = True
         active = active[good & ~reached & np.isfinite(size)]
     # Rounding may keep the last step just above the tolerance; a point that maps back is converged.

@@ -24,9 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
-
-# Points of the grid along each side: ten for each of the nine unknowns.
-_POINTS = 10
+from semcal_ros.core.camera.thresholds import PLUMB_BOB_POINTS
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,10 @@ def fit_plumb_bob(camera: ScanCamera, width: int, height: int) -> PlumbBobCamera
     if not np.isfinite(f):
         return None
     n = 0.5 * width
-    xs, ys = np.linspace(0.0, width - 1.0, _POINTS), np.linspace(0.0, height - 1.0, _POINTS)
+    xs, ys = (
+        np.linspace(0.0, width - 1.0, PLUMB_BOB_POINTS),
+        np.linspace(0.0, height - 1.0, PLUMB_BOB_POINTS),
+    )
     rect_px = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     raw_px = fitted.raw_from_rect(rect_px)
     good = np.all(np.isfinite(raw_px), axis=1)

@@ -34,10 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array, check_positive
+from semcal_ros.core.camera.thresholds import FRAME_TIME_MAX_S
 from semcal_ros.core.errors import InvalidValueError
-
-# Eleven days: what is longer has lost its unit.
-_LONGEST_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,10 @@ class ScanTiming:
 
     def __post_init__(self) -> None:
         check_positive(self.frame_time_s, "frame time", "s")
-        if self.frame_time_s > _LONGEST_S:
+        if self.frame_time_s > FRAME_TIME_MAX_S:
             raise InvalidValueError(
                 f"frame time {self.frame_time_s:g} s",
-                expected=f"at most {_LONGEST_S:g} s",
+                expected=f"at most {FRAME_TIME_MAX_S:g} s",
                 do="state the unit, as in --frame-time 500ms",
             )
         if self.averages < 1:

@@ -29,6 +29,7 @@ from semcal_ros.core.camera.scan_distortion import (
     SETTLING,
     deflection_shift,
 )
+from semcal_ros.core.camera.thresholds import TERM_SIZES_ACROSS
 
 TERM_KINDS: tuple[str, ...] = (
     "radial",
@@ -39,8 +40,6 @@ TERM_KINDS: tuple[str, ...] = (
     "residual field",
 )
 """The kinds of distortion: of the lens, of the scan, and what both leave."""
-# Points of the lattice along each side of the picture, its outermost pixels among them.
-_ACROSS = 33
 
 
 def has_terms(camera: ScanCamera) -> bool:
@@ -102,7 +101,7 @@ def measure_along_axes(camera: ScanCamera, kind: str) -> tuple[float, float]:
 
 
 def _displace_lattice(camera: ScanCamera, kind: str) -> Array:
-    x, y = (np.linspace(0.0, n - 1.0, _ACROSS) for n in (camera.width, camera.height))
+    x, y = (np.linspace(0.0, n - 1.0, TERM_SIZES_ACROSS) for n in (camera.width, camera.height))
     return displace_by(camera, kind, np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1))
 
 

@@ -28,15 +28,13 @@ import numpy as np
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import RectifiedCamera
+from semcal_ros.core.camera.thresholds import (
+    COVERAGE_FACTOR,
+    JUDGED_MAGNIFICATIONS,
+    LENGTH_PLACES,
+    SPECIMEN_TILT_SIGMA_RAD,
+)
 from semcal_ros.core.errors import InvalidValueError
-
-#: Tilt of a specimen that is mounted flat, 1-sigma: half a degree, as in the priors of a calibration.
-_TILT_SIGMA_RAD = 0.0087
-_COVERAGE = 2.0
-# Magnifications at which the range is judged: four per factor of two over two decades.
-_JUDGED = 25
-# Where a length may lie in the image, as a part of width and height: the worst of these places counts.
-_PLACES = (0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True)
@@ -83,12 +81,12 @@ class UncertaintyBudget:
     @property
     def coverage(self) -> float:
         """Coverage factor k of :attr:`expanded_m`."""
-        return _COVERAGE
+        return COVERAGE_FACTOR
 
     @property
     def expanded_m(self) -> float:
         """Expanded uncertainty, m."""
-        return _COVERAGE * self.sigma_m
+        return COVERAGE_FACTOR * self.sigma_m
 
     def share(self, part: BudgetPart) -> float:
         """Part of the combined variance, 0 to 1."""
@@ -136,7 +134,7 @@ def _scale_parts(
         "place of a relay": 0.0 if ladder is None else ladder.relay_sigma(magnification),
         **_split_views(model, magnification, views),
         # The cosine of a small tilt differs from 1 by half of its square, of which this is the RMS.
-        "tilt of the specimen": 0.5 * math.sqrt(3.0) * _TILT_SIGMA_RAD**2,
+        "tilt of the specimen": 0.5 * math.sqrt(3.0) * SPECIMEN_TILT_SIGMA_RAD**2,
     }
     if height_m:
         rho_sigma = math.sqrt(max(float(camera.covariance[5, 5]), 0.0))
@@ -167,7 +165,7 @@ def worst_pixel_size(model: CalibrationModel) -> tuple[float, float]:
     """Largest relative 1-sigma of nm per pixel in the calibrated range, of the worse axis, and its magnification."""
     low, high = model.magnification_range
     # The ends of the range come out of the logarithm with a rounding error.
-    judged = np.clip(np.geomspace(low, high, _JUDGED), low, high)
+    judged = np.clip(np.geomspace(low, high, JUDGED_MAGNIFICATIONS), low, high)
     cameras = [model.at(float(g)) for g in judged]
     sigmas = [
         max(s / x for s, x in zip(c.pixel_size_sigma_m, c.pixel_size_m, strict=True))
@@ -247,8 +245,8 @@ def _distortion(camera: RectifiedCamera, length_px: float) -> float:
         step = np.zeros(2)
         step[axis] = 0.5 * min(length_px, full - 1.0)
         relative = camera.pixel_size_sigma_m[axis] / camera.pixel_size_m[axis]
-        for x in _PLACES:
-            for y in _PLACES:
+        for x in LENGTH_PLACES:
+            for y in LENGTH_PLACES:
                 middle = np.array([x * camera.width, y * camera.height])
                 # A length that does not fit there is moved to where it does.
                 room = (camera.width, camera.height)

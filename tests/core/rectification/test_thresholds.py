@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from semcal_ros.core.camera.scan_distortion import SETTLING_TIMES
+from semcal_ros.core.camera.thresholds import SETTLING_TIMES
 from semcal_ros.core.rectification import thresholds as t
 
 WIDTH_PX = 512.0
