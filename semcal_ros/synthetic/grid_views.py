@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Views of a chess grid with known truth, without images."""
+"""Views of a checkerboard with known truth, without images."""
 
 from __future__ import annotations
 

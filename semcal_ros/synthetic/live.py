@@ -150,7 +150,7 @@ class LiveFrame:
     drift_m
         (2,) drift at the centre of the acquisition, without the travel of the stage.
     square_m
-        Square size when the specimen is the chess grid, else None.
+        Square size when the specimen is the checkerboard, else None.
     visit_scale
         Factor with which this magnification came back.
     """

@@ -14,8 +14,8 @@
 
 """The grid finder: lattices at all scales, the pattern of their cells, sub-pixel fit, rejection.
 
-Smoothed to its spacing, every grid on a square lattice is the chess board that its strongest
-harmonics make: a chess board itself, or dots, crosses and crossed lines, whose saddle points lie
+Smoothed to its spacing, every grid on a square lattice is the checkerboard that its strongest
+harmonics make: a checkerboard itself, or dots, crosses and crossed lines, whose saddle points lie
 between them. So one search grows lattices of saddle points at all scales; the unit cell of each, made
 of its bright squares, says which pattern it is; and what is most likely is fitted at sub-pixel
 accuracy.
@@ -125,7 +125,7 @@ class LatticeDetection:
     rejected_xy
         (k, 2) expected positions of lattice points in the image that were rejected, px.
     pattern
-        What the points are: corners of a chess board, centres of dots or crosses, crossings of lines, or places on
+        What the points are: corners of a checkerboard, centres of dots or crosses, crossings of lines, or places on
         parallel lines.
     odds
         How many times as likely this pattern is as the next one; at most a million.
@@ -159,7 +159,7 @@ def find_lattice(
 
     Candidates are lattices through saddle points of the image at all scales, up to points a quarter of the picture
     apart; where none of them shows its pattern clearly, also the cells that its spatial frequencies tell (see
-    :mod:`semcal_ros.core.corners.crossed_waves`). Corners of a chess board are fitted by a model of two crossing
+    :mod:`semcal_ros.core.corners.crossed_waves`). Corners of a checkerboard are fitted by a model of two crossing
     blurred edges (see :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance; dots, crosses
     and crossings of lines by their mean cell (see :mod:`semcal_ros.core.corners.dots_and_lines`). Where edges are
     rough or blurred over many pixels, that is done in a reduced picture.
@@ -212,7 +212,7 @@ def find_lattice(
             break
     if best is not None and (is_clear or crossed is not None):
         return best
-    # Of a chess board, the corners are elsewhere than its cells.
+    # Of a checkerboard, the corners are elsewhere than its cells.
     if crossed is not None and (wanted not in ("auto", "chess") or not crossed.is_likely_chess):
         measured = _measure_likely(pyramid, crossed, wanted)
         if isinstance(measured, LatticeDetection):
@@ -350,7 +350,7 @@ class _Candidate:
     filled, regular
         Parts of the image that its squares cover, and that those of them cover which continue their neighbours.
     is_mixture
-        Whether only every other bright square is a cell, so that the lattice is not that of a chess board.
+        Whether only every other bright square is a cell, so that the lattice is not that of a checkerboard.
     """
 
     corners: Lattice
@@ -367,12 +367,12 @@ class _Candidate:
 
     @property
     def is_likely_chess(self) -> bool:
-        """Whether its cells are most likely those of a chess board."""
+        """Whether its cells are most likely those of a checkerboard."""
         return self.shapes is not None and self.shapes.best.pattern == "chess"
 
 
 def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
-    """Find lattices scale by scale; a clear chess board that fills the image ends the search."""
+    """Find lattices scale by scale; a clear checkerboard that fills the image ends the search."""
     image, size = pyramid.image, pyramid.size
     for scale in SCALES_PX:
         if scale > SCALE_MAX_PART * min(size) and scale > SCALES_PX[0]:
@@ -417,7 +417,7 @@ def _likely_shapes(
     if shapes is None:
         # Of the few squares of a small board, none may be in view as a whole.
         return [CellShape("chess", True, 1.0, 0.0, 0.0)] if wanted in ("auto", "chess") else []
-    # Of a chess board, the corners are elsewhere than the cells of a mixture.
+    # Of a checkerboard, the corners are elsewhere than the cells of a mixture.
     may_be_chess = shapes.allows("chess") and not candidate.is_mixture
     if shapes.asymmetry > CELL_ASYMMETRY_MAX and not may_be_chess:
         return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
@@ -427,7 +427,7 @@ def _likely_shapes(
             likely = [s for s in shapes.every if s.pattern != "chess"]
         likely.sort(key=shapes.rank)
         return list(likely)
-    # The same points lie at the middle of dots and of crosses: only a chess board has others.
+    # The same points lie at the middle of dots and of crosses: only a checkerboard has others.
     if (shapes.best.pattern == "chess") != (wanted == "chess") and not shapes.allows(wanted):
         seen = shapes.best.pattern
         return [
@@ -495,7 +495,7 @@ def _refine(
 def _judge_chess(
     pyramid: _Pyramid, candidate: _Candidate, corners: RefinedCorners
 ) -> LatticeDetection | Rejection[LatticeStatus]:
-    """Return the corners if they are good enough and, as fitted, still those of a chess board."""
+    """Return the corners if they are good enough and, as fitted, still those of a checkerboard."""
     judged = _judge(corners, candidate, pyramid.size, "chess")
     if isinstance(judged, Rejection) or candidate.is_clear:
         return judged

@@ -15,8 +15,8 @@
 """Find grids of dots or holes, and gratings of crossed lines, at sub-pixel accuracy.
 
 Between the dots of a square lattice the grey value has saddle points, and so it has between the
-crossings of lines: smoothed to the spacing, all these patterns are the chess board that their
-strongest harmonics make, turned by 45 degrees. So the lattice is grown as that of a chess board, and
+crossings of lines: smoothed to the spacing, all these patterns are the checkerboard that their
+strongest harmonics make, turned by 45 degrees. So the lattice is grown as that of a checkerboard, and
 its squares are the cells of the pattern.
 """
 

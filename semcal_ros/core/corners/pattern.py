@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tell chess boards, dots, crosses and crossed lines apart by the Fourier coefficients of their unit cell.
+"""Tell checkerboards, dots, crosses and crossed lines apart by the Fourier coefficients of their unit cell.
 
-All of them repeat on a square lattice, and a chess board is a lattice of squares that touch at their
+All of them repeat on a square lattice, and a checkerboard is a lattice of squares that touch at their
 corners. What differs is the shape of the bright part: a square on its tip (chess), a disc (dots,
 holes), a plus sign (crosses), or a square in line with the lattice (the opening between crossed
 lines). Its transform is known in closed form; size and blur are fitted for each shape, and the best
@@ -148,8 +148,8 @@ class CellShapes:
     def rank(self, shape: CellShape) -> tuple[int, float]:
         """Return what sorts shapes by how likely they are; of those that are about as likely, the commoner comes first.
 
-        Any blurred pattern may be a chess board, and blurred or stubby crosses may be dots, which have the same middle.
-        A chess board has other points, by which the scale would be wrong: it is not presumed by as much.
+        Any blurred pattern may be a checkerboard, and blurred or stubby crosses may be dots, which have the same
+        middle. A checkerboard has other points, by which the scale would be wrong: it is not presumed by as much.
         """
         ratio = COMPARABLE_RATIO if shape.pattern == "chess" else AMBIGUOUS_RATIO
         if shape.misfit > ratio * self._least.misfit:

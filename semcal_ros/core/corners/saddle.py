@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Saddle points of a smoothed image: the candidates for chess-board corners at one scale."""
+"""Saddle points of a smoothed image: the candidates for checkerboard corners at one scale."""
 
 from __future__ import annotations
 

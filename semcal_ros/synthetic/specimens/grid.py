@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The interface of a specimen, and the two simplest: the chess grid, with its faults, and a uniform one."""
+"""The interface of a specimen, and the two simplest: the checkerboard, with its faults, and a uniform one."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ class FlatSpecimen:
 
 @dataclass(frozen=True)
 class ChessGrid:
-    """An endless chess board whose corners should be at the integer multiples of ``square_m``.
+    """An endless checkerboard whose corners should be at the integer multiples of ``square_m``.
 
     The square between (0, 0) and (1, 1) squares is bright.
 

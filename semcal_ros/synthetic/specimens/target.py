@@ -65,7 +65,7 @@ class TargetSpecimen:
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
         """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
-        # As for the chess grid: a box with the second moment of the sample's parallelogram on each axis of the
+        # As for the checkerboard: a box with the second moment of the sample's parallelogram on each axis of the
         # target.
         box_m = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
         seen = np.ones(x_m.shape, dtype=np.float32)
