@@ -301,6 +301,9 @@ def _moves(
 # Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
 # calibration then carries a warning.
 _MAX_ROUNDS = 5
+# Rounds in which a choice has no right to stay, so that it does not depend on where the fit came from; but as long as
+# the corners are believed less than stated, where a choice that went to and fro would lead astray.
+_FREE_ROUNDS = 2
 # Steps in which corners come to be believed, and the part of the excess noise beyond which there is no further one.
 _MOST_STEPS, _LEAST_STEP = 3, 0.7
 # Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
@@ -358,7 +361,8 @@ def select_and_adjust(
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=terms)
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
-        chosen = select_functions(summary, setup, functions, SMOOTH, terms, sizes)
+        kept = None if setup.tempering == 1.0 and rounds <= _FREE_ROUNDS else sizes
+        chosen = select_functions(summary, setup, functions, SMOOTH, terms, kept)
         if chosen == sizes:
             result, count = adjust_with_other_poses(setup, functions, spread, problem, result.state)
             converged = count == 0
