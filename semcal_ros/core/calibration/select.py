@@ -88,6 +88,8 @@ _GAIN_PER_COEFFICIENT = 1.0
 # That of a term that is not there yet: by chance in one of 600 terms that are not needed, as the chance of a chi-square
 # of one degree of freedom above 10.
 _GAIN_OF_TERM = 5.0
+# What a camera need not have.
+_TERMS = tuple(name for name in TERM_NAMES if name not in SMOOTH)
 # Most coefficients of a function of the scan: coils and settling hardly change with the magnification.
 _MAX_SCAN_SIZE = 3
 # Gain in half chi-squares by which a choice must be better to replace the previous one.
@@ -356,7 +358,7 @@ def select_and_adjust(
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
-    terms = () if setup.priors.is_wide or not choose_terms else TERM_NAMES
+    terms = () if setup.priors.is_wide or not choose_terms else _TERMS
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=terms)
