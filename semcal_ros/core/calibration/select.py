@@ -241,7 +241,9 @@ def select_functions(
     choice stays unless another one is clearly better.
     """
     candidates = _Candidates(summary, setup, functions, terms)
-    most = len(setup.magnifications) - 1
+    # Each magnification is predicted from the others. Two are only fitted, by a straight line.
+    known = len(setup.magnifications)
+    most = known if known == 2 else known - 1
     limits = {name: min(_MAX_SIZE, most) for name in free}
     limits |= {name: min(_most_of(name), max(most, 1)) for name in terms}
     sizes = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
