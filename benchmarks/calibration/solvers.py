@@ -16,11 +16,12 @@
 
     python -m benchmarks.calibration.solvers [--recording grid_calibration]
 
-The views are those of a reference recording, the functions those that its calibration chooses, and the start is the
-first state of that calibration. Beside `refine` there is `scipy.optimize.least_squares` (trust region, sparse), and,
-where they are installed (`pip install pyceres gtsam`), Ceres and GTSAM, with one residual block per view. All get the
-derivatives of `corner_rows`. *above* is the cost above the least that any has reached, in half chi-squares; *sigmas*
-the largest difference of a coefficient from that of `refine`, in its stated sigmas; *seconds* is processor time.
+The views are those of a reference recording with some corners of each, the functions those that its calibration
+chooses, and the start is the first state of that calibration. Beside `refine` there is `scipy.optimize.least_squares`
+(trust region, sparse), and, where they are installed (`pip install pyceres gtsam`), Ceres and GTSAM, with one residual
+block per view. All get the derivatives of `corner_rows`. *above* is the cost above the least that any has reached, in
+half chi-squares; *sigmas* the largest difference of a coefficient from that of `refine`, in its stated sigmas;
+*seconds* is processor time.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -52,6 +54,7 @@ from semcal_ros.core.calibration.estimator.blocks import (
     states_of,
 )
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine, refit_functions
+from semcal_ros.core.calibration.estimator.poses import thin_view
 from semcal_ros.core.calibration.estimator.problem import (
     Setup,
     build_problem,
@@ -175,7 +178,9 @@ def solve_by_scipy(unknowns: Unknowns) -> State:
     sigma, left, visit_sigma = parts.priors()
     visits = unknowns.base.visits / visit_sigma
 
-    def every(x: Array) -> tuple[Array, Any]:
+    @lru_cache(maxsize=1)
+    def every(at: bytes) -> tuple[Array, Any]:
+        x = np.frombuffer(at)
         values, blocks = [], []
         for v, visit in enumerate(parts.visit):
             own = slice(k + j + v * width, k + j + (v + 1) * width)
@@ -195,9 +200,9 @@ def solve_by_scipy(unknowns: Unknowns) -> State:
         return np.concatenate(values), scipy.sparse.vstack(blocks, format="csr")
 
     found = least_squares(
-        lambda x: every(x)[0],
+        lambda x: every(x.tobytes())[0],
         np.zeros(k + j + size),
-        jac=lambda x: every(x)[1],
+        jac=lambda x: every(x.tobytes())[1],
         x_scale="jac",
         ftol=_TOLERANCE,
         xtol=None,
@@ -341,9 +346,9 @@ def main() -> int:
     parser.add_argument("--recording", default="grid_calibration", help="of the reference data")
     given = parser.parse_args()
     found = found_in(reference_folder() / given.recording, lambda _k, _g: True)
-    unknowns = draw_problem(
-        prepare(found.views, image_size=found.image_size, display_width_m=CONFIG.display_width_m)
-    )
+    views = [thin_view(view) for view in found.views]
+    setup = prepare(views, image_size=found.image_size, display_width_m=CONFIG.display_width_m)
+    unknowns = draw_problem(setup)
     problem, ends = unknowns.problem, {}
     for name, (package, solve) in SOLVERS.items():
         if package is not None and importlib.util.find_spec(package) is None:
