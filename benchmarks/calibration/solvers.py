@@ -180,7 +180,7 @@ def solve_by_scipy(unknowns: Unknowns) -> State:
 
     @lru_cache(maxsize=1)
     def every(at: bytes) -> tuple[Array, Any]:
-        x = np.frombuffer(at)
+        x = np.frombuffer(at).copy()
         values, blocks = [], []
         for v, visit in enumerate(parts.visit):
             own = slice(k + j + v * width, k + j + (v + 1) * width)

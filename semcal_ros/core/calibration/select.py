@@ -305,8 +305,8 @@ def _moves(
 # Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
 # calibration then carries a warning.
 _MAX_ROUNDS = 5
-# Rounds in which a choice has no right to stay, so that it does not depend on where the fit came from; but as long as
-# the corners are believed less than stated, where a choice that went to and fro would lead astray.
+# Rounds in which a choice has no right to stay once the corners count as stated, so that it does not depend on where
+# the fit came from. Before, a choice that went to and fro would lead astray.
 _FREE_ROUNDS = 2
 # Steps in which corners come to be believed, and the part of the excess noise beyond which there is no further one.
 _MOST_STEPS, _LEAST_STEP = 3, 0.7
@@ -338,7 +338,13 @@ def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, 
             break
         level, noisy = excess, tempered(setup, excess)
         spread = update_components(noisy, adjustment.problem, adjustment.result)
-        adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
+        adjustment = select_and_adjust(
+            noisy,
+            adjustment.functions,
+            adjustment.result.state,
+            spread,
+            free_rounds=_FREE_ROUNDS if noisy.tempering == 1.0 else 0,
+        )
     return noisy, adjustment
 
 
@@ -350,11 +356,13 @@ def select_and_adjust(
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
     choose_terms: bool = True,
+    free_rounds: int = 0,
 ) -> Adjustment:
     """Choose the number of coefficients of every function, and further terms of the camera, until the choice no longer
     changes.
 
-    Beside a residual field the terms stay as they are, since it takes the place of those that are not there.
+    In the first ``free_rounds`` the choice before, ``sizes`` or that of the last round, has no right to stay. Beside a
+    residual field the terms stay as they are, since it takes the place of those that are not there.
     """
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
@@ -365,7 +373,7 @@ def select_and_adjust(
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=terms)
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
-        kept = None if setup.tempering == 1.0 and rounds <= _FREE_ROUNDS else sizes
+        kept = None if rounds <= free_rounds else sizes
         chosen = select_functions(summary, setup, functions, SMOOTH, terms, kept)
         if chosen == sizes:
             result, count = adjust_with_other_poses(setup, functions, spread, problem, result.state)
