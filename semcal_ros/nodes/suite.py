@@ -47,7 +47,10 @@ _PARAMETERS = (
         fixed=True,
     ),
     ParameterDeclaration(
-        "viewer", True, "Also show the stream in the browser, as `semcal view` does.", fixed=True
+        "viewer",
+        True,
+        "Also show the stream in the browser, as `semcal view` does; its parameters are host, port and token.",
+        fixed=True,
     ),
     ParameterDeclaration(
         "consumers",

@@ -93,7 +93,7 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 
-__all__ = ["FEWEST_VIEWS", "are_enough", "calibrate_views", "fit_joint"]
+__all__ = ["FEWEST_VIEWS", "are_enough", "calibrate_views", "fit_joint", "prepare"]
 
 # A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
 FEWEST_VIEWS = 3
@@ -150,6 +150,43 @@ def calibrate_views(
     """
     options = options or CalibrationOptions()
     views, options, lines = _prepare_lines(views, options)
+    setup, factor = _prepare(views, image_size, display_width_m, options, priors)
+    if options.method != "joint":
+        on_stage("one magnification after the other", 0.0)
+        fit = fit_separately(setup, options.method, options.method_options)
+        _check_converged(setup, fit, factor)
+        return judge(setup, fit, options, None, ())
+    joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+    notes += lines
+    fit = describe_fit(setup, joint)
+    if options.untilted == "auto":
+        notes += _propose_untilted(setup, joint, fit)
+    fit = replace(fit, findings=(*notes, *fit.findings))
+    _check_converged(setup, fit, factor)
+    on_stage("held-out magnifications", 0.95)
+    return judge(setup, fit, options, joint, outliers)
+
+
+def prepare(
+    views: Sequence[GridView],
+    *,
+    image_size: tuple[int, int],
+    display_width_m: float,
+    options: CalibrationOptions | None = None,
+) -> Setup:
+    """Return what is known before a fit, from where :func:`fit_joint` goes on; as for :func:`calibrate_views`."""
+    views, options, _ = _prepare_lines(views, options or CalibrationOptions())
+    return _prepare(views, image_size, display_width_m, options, None)[0]
+
+
+def _prepare(
+    views: Sequence[GridView],
+    image_size: tuple[int, int],
+    display_width_m: float,
+    options: CalibrationOptions,
+    priors: Priors | None,
+) -> tuple[Setup, float]:
+    """Return what is known before a fit, and the ratio of the observed to the nominal scale."""
     ordered = _check_views(views, options)
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _check_breakpoints(options.breakpoints, magnifications)
@@ -167,20 +204,7 @@ def calibrate_views(
     if options.method == "joint":
         setup = replace(setup, axis=options.axis)
         setup = add_shared_unknowns(align_lattices(mark_untilted(setup, options.untilted)))
-    if options.method != "joint":
-        on_stage("one magnification after the other", 0.0)
-        fit = fit_separately(setup, options.method, options.method_options)
-        _check_converged(setup, fit, factor)
-        return judge(setup, fit, options, None, ())
-    joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
-    notes += lines
-    fit = describe_fit(setup, joint)
-    if options.untilted == "auto":
-        notes += _propose_untilted(setup, joint, fit)
-    fit = replace(fit, findings=(*notes, *fit.findings))
-    _check_converged(setup, fit, factor)
-    on_stage("held-out magnifications", 0.95)
-    return judge(setup, fit, options, joint, outliers)
+    return setup, factor
 
 
 def fit_joint(

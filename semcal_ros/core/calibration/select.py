@@ -88,6 +88,8 @@ _GAIN_PER_COEFFICIENT = 1.0
 # That of a term that is not there yet: by chance in one of 600 terms that are not needed, as the chance of a chi-square
 # of one degree of freedom above 10.
 _GAIN_OF_TERM = 5.0
+# What a camera need not have.
+_TERMS = tuple(name for name in TERM_NAMES if name not in SMOOTH)
 # Most coefficients of a function of the scan: coils and settling hardly change with the magnification.
 _MAX_SCAN_SIZE = 3
 # Gain in half chi-squares by which a choice must be better to replace the previous one.
@@ -239,7 +241,9 @@ def select_functions(
     choice stays unless another one is clearly better.
     """
     candidates = _Candidates(summary, setup, functions, terms)
-    most = len(setup.magnifications) - 1
+    # Each magnification is predicted from the others. Two are only fitted, by a straight line.
+    known = len(setup.magnifications)
+    most = known if known == 2 else known - 1
     limits = {name: min(_MAX_SIZE, most) for name in free}
     limits |= {name: min(_most_of(name), max(most, 1)) for name in terms}
     sizes = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
@@ -301,6 +305,9 @@ def _moves(
 # Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
 # calibration then carries a warning.
 _MAX_ROUNDS = 5
+# Rounds in which a choice has no right to stay once the corners count as stated, so that it does not depend on where
+# the fit came from. Before, a choice that went to and fro would lead astray.
+_FREE_ROUNDS = 2
 # Steps in which corners come to be believed, and the part of the excess noise beyond which there is no further one.
 _MOST_STEPS, _LEAST_STEP = 3, 0.7
 # Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
@@ -331,7 +338,13 @@ def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, 
             break
         level, noisy = excess, tempered(setup, excess)
         spread = update_components(noisy, adjustment.problem, adjustment.result)
-        adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
+        adjustment = select_and_adjust(
+            noisy,
+            adjustment.functions,
+            adjustment.result.state,
+            spread,
+            free_rounds=_FREE_ROUNDS if noisy.tempering == 1.0 else 0,
+        )
     return noisy, adjustment
 
 
@@ -343,22 +356,25 @@ def select_and_adjust(
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
     choose_terms: bool = True,
+    free_rounds: int = 0,
 ) -> Adjustment:
     """Choose the number of coefficients of every function, and further terms of the camera, until the choice no longer
     changes.
 
-    Beside a residual field the terms stay as they are, since it takes the place of those that are not there.
+    In the first ``free_rounds`` the choice before, ``sizes`` or that of the last round, has no right to stay. Beside a
+    residual field the terms stay as they are, since it takes the place of those that are not there.
     """
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
-    terms = () if setup.priors.is_wide or not choose_terms else TERM_NAMES
+    terms = () if setup.priors.is_wide or not choose_terms else _TERMS
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=terms)
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
-        chosen = select_functions(summary, setup, functions, SMOOTH, terms, sizes)
+        kept = None if rounds <= free_rounds else sizes
+        chosen = select_functions(summary, setup, functions, SMOOTH, terms, kept)
         if chosen == sizes:
             result, count = adjust_with_other_poses(setup, functions, spread, problem, result.state)
             converged = count == 0

@@ -192,7 +192,7 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     if field is not None:
         final = undo_field(setup, field.field)
     # The corners are believed to their own noise now.
-    spread = update_components(setup, adjustment.problem, adjustment.result)
+    spread = update_components(final, adjustment.problem, adjustment.result)
     adjustment = select_and_adjust(
         final, adjustment.functions, adjustment.result.state, spread, choose_terms=field is None
     )

@@ -56,6 +56,10 @@ PARAMETER_NAMES: tuple[str, ...] = (
 """The parameters that every camera has."""
 ALL_NAMES: tuple[str, ...] = (*PARAMETER_NAMES, "xi_s", "xi_u", *SCAN_NAMES)
 """All parameters: after those of every camera further distortion of the lens, and the distortion of the scan."""
+CAMERA_SIZES: tuple[int, ...] = tuple(
+    ALL_NAMES.index(last) + 1 for last in ("ey", "xi_u", SCAN_NAMES[-1])
+)
+"""How many of :data:`ALL_NAMES` a camera may have: the first ones, those of the lens, or all. Fewer are faster."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class ProjectionJacobians:
 def project_ideal_points(parameters: Array, xyz_m: Array) -> Array:
     """Project points to undistorted pixels (n, 2); NaN at or behind the pivot.
 
-    ``parameters`` has shape (P,) or (n, P), with the first P of :data:`ALL_NAMES`: 10 or all.
+    ``parameters`` has shape (P,) or (n, P), with the first P of :data:`ALL_NAMES`, one of :data:`CAMERA_SIZES`.
     """
     m, a, skew, px, py, rho = np.moveaxis(parameters[..., :6], -1, 0)
     w = 1.0 + rho * xyz_m[:, 2]
@@ -105,9 +109,10 @@ def project_points(parameters: Array, xyz_m: Array, raster: Raster) -> Array:
 def _distortion(parameters: Array) -> tuple[list[Array], Array | None]:
     """Return the coefficients of the lens, and the amplitudes of the scan where there are any."""
     lens = [parameters[..., 6], parameters[..., 7]]
-    if parameters.shape[-1] == len(PARAMETER_NAMES):
-        return lens, None
-    return [*lens, parameters[..., 10], parameters[..., 11]], parameters[..., 12:]
+    count = parameters.shape[-1]
+    if count > CAMERA_SIZES[0]:
+        lens += [parameters[..., 10], parameters[..., 11]]
+    return lens, parameters[..., 12:] if count > CAMERA_SIZES[1] else None
 
 
 def project_points_with_jacobians(
@@ -160,8 +165,9 @@ def project_points_with_jacobians(
         d_parameters[row, 8] = -by_x
         d_parameters[row, 9] = -by_y
         d_parameters[row, 8 + row] += per_stretch
-        if scan is not None:
+        if count > CAMERA_SIZES[0]:
             d_parameters[row, 10:12] = by_xi[2:]
+        if scan is not None:
             functions = slice(0, ALONG_COUNT) if row == 0 else slice(ALONG_COUNT, None)
             d_parameters[row, 12:][functions] = -per_stretch * scan.basis[functions]
     return ProjectionJacobians(

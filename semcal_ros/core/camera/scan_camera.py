@@ -380,12 +380,14 @@ class ScanCamera:
 
     def distort(self, xy: ArrayLike) -> Array:
         """Distort undistorted pixels (n, 2) to raw pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
-        q = (as_points(xy, 2) - self._centre) / self.norm_px
-        seen = self._centre + self.norm_px * distort_normalised(q, *self._lens)
-        amplitudes = self._scan_amplitudes
+        seen, amplitudes = self._distort_by_lens(xy), self._scan_amplitudes
         if np.any(amplitudes):
             seen = raw_from_deflection(seen, amplitudes, self.raster)
         return self._with_residual(seen)
+
+    def _distort_by_lens(self, xy: ArrayLike) -> Array:
+        q = (as_points(xy, 2) - self._centre) / self.norm_px
+        return self._centre + self.norm_px * distort_normalised(q, *self._lens)
 
     def undistort(self, xy: ArrayLike) -> Array:
         """Undistort raw pixels (n, 2) to undistorted pixels (n, 2).
@@ -438,6 +440,10 @@ class ScanCamera:
         Every rectification of an image samples it here.
         """
         return self.distort(self.ideal_from_rect(xy))
+
+    def deflection_from_rect(self, xy: ArrayLike) -> Array:
+        """Map rectified pixels (n, 2) to where the beam should be, px, as :meth:`deflect` does raw ones."""
+        return self._distort_by_lens(self.ideal_from_rect(xy))
 
     @cached_property
     def rectified(self) -> RectifiedCamera:

@@ -38,6 +38,7 @@ from semcal_ros.core.rectification.raw_positions import (
     PixelDrift,
     RasterDrift,
     camera_key,
+    deflection_from_output,
     raw_from_output,
 )
 from semcal_ros.core.rectification.thresholds import (
@@ -71,8 +72,27 @@ _MAX_RESPONSE_ERROR_PX = MOVING_ERROR_MAX_PX - MAP_ERROR_MAX_PX
 _IDENTITY = np.eye(2, dtype=np.float32)
 
 
-# Deflections in rising order and raw minus deflected pixels, by the axis.
-_ScanTables = dict[int, tuple[Array, Array]]
+@dataclass(frozen=True)
+class _ScanTables:
+    """The distortion of a scan at many places.
+
+    Attributes
+    ----------
+    by_axis
+        For each axis that has any, deflections in rising order and raw minus deflected pixels.
+    begin_px
+        Deflection along the lines at their beginning.
+    """
+
+    by_axis: dict[int, tuple[Array, Array]]
+    begin_px: float
+
+    def raw(self, deflection: Array) -> Array:
+        """Return the raw pixels (n, 2) at which the beam should be at ``deflection`` (n, 2), px."""
+        raw = deflection.copy()
+        for axis, table in self.by_axis.items():
+            raw[:, axis] += np.interp(deflection[:, axis], *table)
+        return raw
 
 
 @dataclass(frozen=True)
@@ -317,14 +337,16 @@ class SmoothMaps:
         At the nodes the drift is that of the time at which the raw pixel is scanned.
         """
         width, height = size
-        smooth = self._map_by_polynomials(size, camera, drift, timing, deflected=True)
         key = camera.scan_key
         if (tables := self._scan_tables.get((size, key), None)) is None:
             tables = _tabulate_scan(size, camera)
             self._scan_tables.put((size, key), tables)
-        if smooth._columns is None or tables is None:
+        if tables is None:
             return None
-        begin_px = float(camera.deflect([[-0.5, -0.5]])[0, 0])
+        smooth = self._map_by_polynomials(size, camera, drift, timing, tables)
+        if smooth._columns is None:
+            return None
+        begin_px = tables.begin_px
         smooth_degree = len(smooth._columns) - 3
         for degree in [d for d in SCAN_DEGREES if d >= self._scan_degrees.get(size, 0)]:
             rows = _make_field_rows(height, smooth_degree, max(degree, smooth_degree))
@@ -337,7 +359,7 @@ class SmoothMaps:
             identity = np.arange(width, dtype=np.float64), rows.places.astype(np.float64)
             tested = _tested_columns(columns[:-2, :width] + identity[0] - begin_px)
             errors_px = []
-            for axis, table in tables.items():
+            for axis, table in tables.by_axis.items():
                 part = columns[:-2, axis * width : (axis + 1) * width]
                 target = part + identity[axis]
                 added = np.interp(target, *table)
@@ -428,15 +450,14 @@ class SmoothMaps:
         camera: ScanCamera | None,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
-        *,
-        deflected: bool = False,
+        tables: _ScanTables | None = None,
     ) -> RawMap:
         """The map by polynomials alone, or the exact one where they do not follow it.
 
-        It is to where the beam should be if ``deflected``, without the distortion of the scan.
+        With ``tables`` of the distortion of the scan it is to where the beam should be.
         """
         exact = camera, drift, timing
-        interpolated = self._sample_departure(size, *exact, deflected=deflected)
+        interpolated = self._sample_departure(size, *exact, tables)
         if interpolated is None:
             return RawMap(size, None, None, exact)
         interpolant, departure = interpolated
@@ -456,21 +477,21 @@ class SmoothMaps:
         camera: ScanCamera | None,
         drift: RasterDrift | None,
         timing: ScanTiming | None,
-        *,
-        deflected: bool,
+        tables: _ScanTables | None,
     ) -> tuple[_Interpolant, Array] | None:
         """The map minus the identity, (2, nodes, nodes) of x and y, at the nodes of the lowest
         degree that is accurate, or None where none is.
         """
         # Neighbouring magnifications need the same degree.
-        key = (*size, camera is not None and camera.residual is not None, deflected)
-        limit_px = DEFLECTION_ERROR_MAX_PX if deflected else MAP_ERROR_MAX_PX
+        key = (*size, camera is not None and camera.residual is not None, tables is not None)
+        limit_px = MAP_ERROR_MAX_PX if tables is None else DEFLECTION_ERROR_MAX_PX
         for degree in [d for d in MAP_DEGREES if d >= self._degrees.get(key, 0)]:
             interpolant = _make_interpolant(size, degree)
             points, nodes = interpolant.points_xy, interpolant.nodes
-            reached = raw_from_output(points, size, camera, drift, timing)
-            if deflected and camera is not None:
-                reached = camera.deflect(reached)
+            if tables is None or camera is None:
+                reached = raw_from_output(points, size, camera, drift, timing)
+            else:
+                reached = deflection_from_output(points, size, camera, drift, timing, tables.raw)
             departure = (reached - points).T
             at_nodes = departure[:, : nodes * nodes].reshape(2, nodes, nodes)
             truth = departure[:, nodes * nodes :].reshape(2, TESTS_PER_AXIS, TESTS_PER_AXIS)
@@ -516,9 +537,7 @@ def _response(
 
 
 def _tabulate_scan(size: tuple[int, int], camera: ScanCamera) -> _ScanTables | None:
-    """Return, for each axis with distortion of the scan, deflections in rising order and raw minus deflected pixels;
-    None where the beam stands still or goes back.
-    """
+    """Return the tables of a scan; None where the beam stands still or goes back."""
     count = int(np.ceil(max(size) / (SCAN_STEP_PX * np.sqrt(size[0] / 512.0)))) + 1
     places = np.linspace(-0.5, 0.5, count)
     places = np.concatenate([[-SCAN_BEYOND], places, [SCAN_BEYOND]])
@@ -530,11 +549,12 @@ def _tabulate_scan(size: tuple[int, int], camera: ScanCamera) -> _ScanTables | N
     if not np.all(np.diff(deflected, axis=0) > 0.0):
         return None
     departure = raw - deflected
-    return {
+    by_axis = {
         axis: (deflected[:, axis].copy(), departure[:, axis].copy())
         for axis in (0, 1)
         if np.any(departure[:, axis])
     }
+    return _ScanTables(by_axis, float(camera.deflect([[-0.5, -0.5]])[0, 0]))
 
 
 def _tested_columns(since: Array) -> Indices:

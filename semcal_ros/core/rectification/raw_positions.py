@@ -28,6 +28,7 @@ distortion of the camera are all in ``raw_from_rect``
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,23 +106,57 @@ def raw_from_output(
     timing
         Raster timing; None takes the frame as an instant, so that the velocity has no effect.
     """
+    if camera is None:
+        return xy.copy() if drift is None else _reach(xy, size, None, drift, timing, _same, _same)
+    return _reach(xy, size, camera, drift, timing, camera.raw_from_rect, _same)
+
+
+def deflection_from_output(
+    xy: Array,
+    size: tuple[int, int],
+    camera: ScanCamera,
+    drift: RasterDrift | None,
+    timing: ScanTiming | None,
+    raw_from_deflection: Callable[[Array], Array],
+) -> Array:
+    """Where the beam should be for rectified pixels (n, 2), px; as :func:`raw_from_output`.
+
+    ``raw_from_deflection`` gives the raw pixels there, at whose times the drift counts. They need not be exact.
+    """
+    reach = camera.deflection_from_rect
+    return _reach(xy, size, camera, drift, timing, reach, raw_from_deflection)
+
+
+def _same(xy: Array) -> Array:
+    return xy
+
+
+def _reach(
+    xy: Array,
+    size: tuple[int, int],
+    camera: ScanCamera | None,
+    drift: RasterDrift | None,
+    timing: ScanTiming | None,
+    reach: Callable[[Array], Array],
+    raw_from_reached: Callable[[Array], Array],
+) -> Array:
+    """What ``reach`` makes of rectified pixels that the drift has moved until their raw pixel is scanned."""
     if drift is None:
-        return xy.copy() if camera is None else camera.raw_from_rect(xy)
+        return reach(xy)
     shift = PixelDrift(size, camera, drift, timing)
     if shift.is_still:
-        moved = shift.moved(xy)
-        return moved if camera is None else camera.raw_from_rect(moved)
+        return reach(shift.moved(xy))
     # What is displaced by little is scanned at nearly the time of its output pixel.
     raw, contraction = xy, shift.contraction
     for _ in range(POSITION_STEPS_MAX):
         # A contraction as long as the drift moves by much less than a row while a row is scanned.
-        moved = shift.moved(xy, raw)
-        new = moved if camera is None else camera.raw_from_rect(moved)
+        reached = reach(shift.moved(xy, raw))
+        new = raw_from_reached(reached)
         change_px = np.abs(new - raw)
         raw = new
         # The error that remains is smaller than the step by the same factor again.
         if not (contraction * change_px > POSITION_CONVERGED_PX).any():
-            return raw
+            return reached
     assert timing is not None
     raise InvalidValueError(
         f"drift of {np.hypot(*shift.velocity_px_s):.3g} px/s with {timing.frame_time_s} s per pass",

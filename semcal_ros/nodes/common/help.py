@@ -39,6 +39,8 @@ class ExecutableHelp:
         Topics and services, as the documentation lists them.
     example
         Arguments of a typical start.
+    nodes
+        Executables whose parameters it takes besides its own.
     """
 
     purpose: str
@@ -46,6 +48,7 @@ class ExecutableHelp:
     outputs: str
     services: str
     example: str
+    nodes: tuple[str, ...] = ()
 
 
 EXECUTABLES = {
@@ -114,6 +117,13 @@ EXECUTABLES = {
         "what its nodes do, images only where somebody subscribes",
         "those of its nodes",
         "-p config:=jsm820 -p source:=openfibsem -p consumers:=none",
+        (
+            "stream_corrector",
+            "parameter_server",
+            "microscope",
+            "bag_player",
+            "virtual_sem",
+        ),
     ),
     "bag_player": ExecutableHelp(
         "Replays a recording on its own topics.",
@@ -158,6 +168,12 @@ def format_help(name: str, declarations: Sequence[ParameterDeclaration]) -> str:
         lines += textwrap.wrap(
             text, _WIDTH, initial_indent=8 * " ", subsequent_indent=8 * " ", break_on_hyphens=False
         )
+    if about.nodes:
+        lines += [
+            "",
+            "and the parameters of its nodes, each as for the executable of that name (--help):",
+        ]
+        lines.append(f"  {', '.join(about.nodes)}")
     lines += ["", f"example: ros2 run semcal_ros {name} --ros-args {about.example}"]
     return "\n".join(lines)
 

@@ -125,7 +125,7 @@ class Consumer:
         self._before_s: float | None = None
         self._interval_s = 0.0
         self._logged: dict[str, float] = {}
-        self.part = Part(self.node, self.fail)
+        self.part = Part(self.node, lambda error: self.fail(error, "a callback of its node"))
 
     def _make(self, entry: EntryPoint) -> Callable[[CalibratedFrame], object]:
         try:
@@ -181,12 +181,12 @@ class Consumer:
             SystemExit,
             KeyboardInterrupt,
         ) as error:  # whatever the code of others may raise
-            self.fail(error)
+            self.fail(error, "the call with a frame")
         if self._waiting:
             self.part.post(self._on_arrival)
 
-    def fail(self, error: BaseException) -> None:
-        """Count and log what the code of others raised."""
+    def fail(self, error: BaseException, where: str) -> None:
+        """Count and log what the code of others raised, and where."""
         self.failed += 1
         self.trouble = f"{type(error).__name__}: {' '.join(str(error).split())}"
         now_s = time.monotonic()
@@ -195,4 +195,4 @@ class Consumer:
         # Only the latest text: one that differs each time, as by a number, must not fill the memory.
         self._logged = {self.trouble: now_s}
         lines = "".join(traceback.format_exception(error))
-        self.node.get_logger().error(f"on_frame raised, and gets the next frame:\n{lines}")
+        self.node.get_logger().error(f"{where} raised; the next frame comes all the same:\n{lines}")

@@ -22,9 +22,11 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine, variance_factor
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import mirror, restart_poses, right_way_up
+from semcal_ros.core.calibration.estimator.posterior import estimate_changes
 from semcal_ros.core.calibration.estimator.problem import (
     Priors,
     Setup,
@@ -39,6 +41,7 @@ from semcal_ros.core.camera.calibration_model import design_matrix
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 
+JSM = preset("jsm820")
 MAGNIFICATIONS = [100.0, 400.0, 1500.0, 5000.0, 10000.0]
 
 
@@ -55,13 +58,22 @@ def fit(setup: Setup) -> JointFit:
     return fit_joint(setup)
 
 
+def _padded(setup: Setup, fit: JointFit) -> tuple[Problem, State]:
+    """The adjustment of the padded functions, whose changes are as large as they seem to be, and the end of the fit."""
+    problem = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
+    state = replace(fit.adjustment.result.state, theta=stack_coefficients(fit.padded))
+    result = refine(problem, state, max_iterations=0)
+    sigma = estimate_changes(fit.padded, problem, result)
+    return replace(problem, prior_sigma=sigma), state
+
+
 def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_move(
     setup: Setup, fit: JointFit
 ) -> None:
     adjustment = fit.adjustment
     start = stack_coefficients(fit.padded)
-    problem = build_problem(setup, fit.padded, setup.views, adjustment.spread)
-    freed = refine(problem, replace(adjustment.result.state, theta=start))
+    problem, state = _padded(setup, fit)
+    freed = refine(problem, state)
     factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
     change = np.abs(freed.state.theta - start)
     sigma = np.sqrt(np.diag(fit.covariance))
@@ -77,8 +89,7 @@ def test_the_part_of_the_corners_is_what_their_noise_does_and_the_parts_fit_in(
     setup: Setup, fit: JointFit
 ) -> None:
     """A tenth of the stated noise is added to the corners, and the scale scatters by that part of its sigma."""
-    problem = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
-    start = replace(fit.adjustment.result.state, theta=stack_coefficients(fit.padded))
+    problem, start = _padded(setup, fit)
     sigma_px = np.concatenate([view.sigma_px for view in setup.views])[:, None]
     rows = np.stack([design_matrix(fit.padded, g, 1.0)[0] for g in (150.0, 700.0, 3000.0, 8000.0)])
     rng = np.random.default_rng(0)
@@ -146,3 +157,27 @@ def test_the_misfit_of_a_start_is_the_distortion_that_a_plane_does_not_explain()
         )
     assert sizes["no_distortion"] < 0.05
     assert 0.1 < sizes["jsm820"] < 3.0
+
+
+def test_magnifications_that_agree_make_the_prior_of_changes_about_half_as_wide() -> None:
+    at_500 = JSM.camera_at(500.0)
+    views = grid_views(
+        lambda g: replace(at_500, magnification=g, m=at_500.m * g / 500.0),
+        (500.0, 1000.0, 2000.0),
+        noise_px=0.05,
+        seed=1,
+    )
+    known = np.array([500.0, 1000.0, 2000.0])
+    setup = Setup(tuple(views), known, JSM.image_size, JSM.display_width_m, Priors())
+    fit = fit_joint(setup)
+    usual = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
+    ratios = _padded(setup, fit)[0].prior_sigma / usual.prior_sigma
+    start = 0
+    for name, function in fit.padded.items():
+        own = ratios[start : start + function.size]
+        start += function.size
+        # The constants, and what has no changes, keep their prior.
+        assert own[0] == 1.0
+        if name in ("aspect", "xi_r", "xi_t"):
+            # Two coefficients are determined at the most, and the usual size counts as a half.
+            assert np.all(own[1:] == own[1]) and np.sqrt(0.5 / 2.5) - 1e-6 <= own[1] < 0.8

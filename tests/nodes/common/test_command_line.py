@@ -121,8 +121,11 @@ for name in EXECUTABLES:
         assert text.startswith(about.purpose)
         assert "\n *config = " in text
         assert f"example: ros2 run semcal_ros {name} --ros-args {about.example}" in text
+        # A parameter of the suite may be that of one of its nodes, which it names.
+        assert not about.nodes or f"\n  {', '.join(about.nodes)}\n" in text
+        known = text + "".join(texts[node] for node in about.nodes)
         for parameter in re.findall(r"-p (\w+):=", about.example):
-            assert re.search(rf"^ [ *]{parameter} = ", text, re.MULTILINE), parameter
+            assert re.search(rf"^ [ *]{parameter} = ", known, re.MULTILINE), parameter
 
 
 def test_help_may_be_cut_short() -> None:

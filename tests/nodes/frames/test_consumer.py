@@ -130,6 +130,26 @@ def test_every_frame_comes_whatever_is_raised(
     consumer.node.destroy_node()
 
 
+def test_it_is_said_which_callback_raised(
+    module: str, ros: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    consumer = Consumer(entry(module, "leave"), depth=20)
+
+    def beat() -> None:
+        raise OSError("no pulse")
+
+    consumer.part.post(beat)
+    consumer.receive(frame(0))
+    run(consumer, 1)
+    said = capfd.readouterr().err
+    for where, what in (
+        ("a callback of its node", "no pulse"),
+        ("the call with a frame", "no more"),
+    ):
+        assert 0 <= said.find(f"{where} raised") < said.find(what)
+    consumer.node.destroy_node()
+
+
 def test_the_oldest_frames_make_room_and_late_ones_are_skipped(module: str, ros: None) -> None:
     consumer = Consumer(entry(module, "see"), depth=4)
     for stamp_ns in range(6):

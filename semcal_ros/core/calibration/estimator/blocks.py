@@ -39,7 +39,7 @@ from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.calibration.stage import OFFSET_NAMES, Attitudes
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
-from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES, CAMERA_SIZES, PARAMETER_NAMES
 from semcal_ros.core.camera.scan_distortion import Raster
 from semcal_ros.core.errors import CalibrationError
 
@@ -313,11 +313,12 @@ class Problem:
         return (*self.parameters, *self.shared).index(name)
 
     def cameras(self, theta: Array) -> Array:
-        """Return the parameters of the cameras, (M, 10), or (M, 25) with others than those of every camera."""
+        """Return the parameters of the cameras, (M, P), P as small of ``CAMERA_SIZES`` as holds them all."""
         own = self.designs[:, : len(self.parameters)] @ theta
         if self.parameters == PARAMETER_NAMES:
             return own
-        out = np.zeros((len(self.designs), len(ALL_NAMES)))
+        size = next(size for size in CAMERA_SIZES if size > self.parameter_index.max())
+        out = np.zeros((len(self.designs), size))
         out[:, self.parameter_index] = own
         return out
 

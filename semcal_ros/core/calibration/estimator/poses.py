@@ -180,7 +180,9 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
 
 
 # Shared unknowns that change their sign when everything is mirrored in the reference plane.
-_ODD = ("grid_curvature_m", "axis_z_m")
+_ODD = ("grid_curvature_m", "axis_z_m", "stage_wedge_x", "stage_wedge_y")
+# Half a turn, after which a tilt about the axis has the other sign.
+_HALF_TURN = np.pi
 # Rounds of turning views over. Each follows an adjustment to the last one, and the rounds end when
 # no view turns.
 _MAX_TURNS = 5
@@ -214,15 +216,18 @@ def mirror(functions: Functions, problem: Problem, state: State) -> State:
     """Return the state mirrored in the reference plane: tilts, heights and the sign of rho.
 
     Every point stays where it is seen, so that views and poses alone do not tell the two states apart; priors do, and
-    what a stage says. Exact where rho is a constant and the stage has no offsets.
+    what a stage says: its axis is turned over, since a tilt of the other sign is one about the opposite axis. Exact
+    where rho is a constant.
     """
     names = list(names_of(functions))
     first = sum(functions[name].size for name in names[: names.index("rho")])
     theta = state.theta.copy()
     theta[first : first + functions["rho"].size] *= -1.0
-    for k, name in enumerate(problem.shared):
+    for k, name in enumerate(problem.shared, start=len(theta) - len(problem.shared)):
         if name in _ODD:
-            theta[len(theta) - len(problem.shared) + k] *= -1.0
+            theta[k] *= -1.0
+        elif name == "stage_axis":
+            theta[k] -= np.copysign(_HALF_TURN, theta[k])
     flip = np.array([1.0, 1.0, -1.0])
     visits = state.visits * [1.0, -1.0] if len(state.visits) else state.visits
     return replace(
@@ -239,10 +244,12 @@ def right_way_up(
 ) -> BundleResult:
     """Return the adjustment, or the one of the mirrored start if that fits better.
 
-    It is tried where the pivot has come to lie on the far side of the specimen, where no microscope has it.
+    It is tried where the pivot has come to lie on the far side of the specimen, where no microscope has it, and where
+    the axis of the stage has come to lie the other way round.
     """
     rho = with_coefficients(functions, result.state.theta)["rho"](setup.magnifications[0])
-    if rho >= 0.0:
+    axis = problem.shared_values(result.state.theta, ["stage_axis"])[0]
+    if rho >= 0.0 and abs(axis) <= 0.5 * _HALF_TURN:
         return result
     other = refine(problem, mirror(functions, problem, result.state), tolerance=COARSE)
     return other if other.cost < result.cost else result
@@ -356,7 +363,7 @@ def adjust_with_other_poses(
     state: State,
 ) -> tuple[BundleResult, int]:
     """Adjust, and adjust to other poses as long as some fit better; return how many did."""
-    result, total = refine_coarsely(problem, state), 0
+    result, total = right_way_up(setup, functions, problem, refine_coarsely(problem, state)), 0
     for _ in range(_MAX_TURNS):
         state, count = try_other_poses(setup, functions, spread, result.state)
         other = refine_coarsely(problem, state) if count else result

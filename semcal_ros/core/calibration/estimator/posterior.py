@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.optimize import nnls
 
-from semcal_ros.core.arrays import Array, Indices, equilibrate, solve_scaled
+from semcal_ros.core.arrays import Array, Indices, equilibrate, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     SMOOTH,
@@ -69,6 +69,7 @@ __all__ = [
     "CovarianceParts",
     "LineJitter",
     "certify",
+    "estimate_changes",
     "estimate_jitter",
     "jitter_covariance",
     "pad_covariance",
@@ -290,6 +291,12 @@ def _positive_part(matrix: Array) -> Array:
 # Number of zero coefficients that are added to the chosen ones, and the least number in all: what
 # the views leave open of them enters the covariance.
 _RESERVE, _LEAST_SIZE = 2, 5
+# Weight of the usual size of the changes of a function, against one coefficient that the views determine: two of them
+# make it half as large at the least, so that few magnifications which happen to agree do not promise too much.
+_USUAL_CHANGES = 0.5
+# Limits of the size of the changes, relative to the usual one, and updates until it changes by a few per cent.
+_CHANGE_LIMITS = (0.1, 3.0)
+_CHANGE_UPDATES = 5
 # Step of a central difference: its error is the square of this, far below what a share is worth.
 _CERTAINTY_STEP = 0.02
 
@@ -330,7 +337,36 @@ def _linearise(
     problem = build_problem(setup, padded, views, adjustment.spread)
     state = adjustment.result.state
     state = replace(state, theta=stack_theta(setup, padded, state))
+    result = refine(problem, state, max_iterations=0)
+    problem = replace(problem, prior_sigma=estimate_changes(padded, problem, result))
     return problem, refine(problem, state, max_iterations=0)
+
+
+def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) -> Array:
+    """Return the (K,) prior sigmas of theta, with those of the changes of each function as large as they seem to be.
+
+    The prior of the changes is that of any microscope. How much a function of this one changes is a variance component,
+    estimated as in :mod:`~semcal_ros.core.calibration.estimator.variance_components`: the squares of its coefficients
+    but the first, in prior sigmas, over the number of them that the views determine.
+    """
+    sigma, theta = problem.prior_sigma.copy(), result.state.theta
+    for _ in range(_CHANGE_UPDATES):
+        known = replace(problem, prior_sigma=sigma)
+        matrix, right = reduced_normal_equations(known, theta, result.information, result.gradient)
+        freed = theta + solve_scaled(matrix, right)
+        variance = np.diagonal(invert_scaled(matrix))
+        start = 0
+        for name in names_of(padded):
+            own = slice(start + 1, start + padded[name].smooth_size)
+            start += padded[name].size
+            if name not in SMOOTH or own.stop == own.start:
+                continue
+            usual = problem.prior_sigma[own]
+            square = float(np.sum((freed[own] / usual) ** 2))
+            determined = float(np.sum(np.maximum(1.0 - variance[own] / sigma[own] ** 2, 0.0)))
+            ratio = np.sqrt((square + _USUAL_CHANGES) / (determined + _USUAL_CHANGES))
+            sigma[own] = usual * np.clip(ratio, *_CHANGE_LIMITS)
+    return sigma
 
 
 def pad_covariance(

@@ -170,6 +170,7 @@ class Setup:
     the problems also have the effects of visits and of drift within the images.
     ``stage_rotation_rad`` is where the constant error of the stage's rotation starts. ``tempering`` is by how much less
     than stated the readings of the stage are believed, as long as the corners are: else a wrong reading would win.
+    ``corrected`` says that a residual field has been taken off the corners.
     """
 
     views: tuple[GridView, ...]
@@ -183,6 +184,7 @@ class Setup:
     stage_rotation_rad: float = 0.0
     tempering: float = 1.0
     raster_ratio: float | None = None
+    corrected: bool = False
 
     @property
     def raster(self) -> Raster:

@@ -226,7 +226,7 @@ def undo_field(setup: Setup, field: ResidualField) -> Setup:
         q = (view.image_xy - setup.centre_px) / setup.norm_px
         shift = setup.norm_px * slices[view.magnification].displacement(q)
         views.append(replace(view, image_xy=view.image_xy + shift))
-    return replace(setup, views=tuple(views))
+    return replace(setup, views=tuple(views), corrected=True)
 
 
 def field_system(

@@ -74,10 +74,13 @@ def update_components(setup: Setup, problem: Problem, result: BundleResult) -> V
     views from above may all share one height.
 
     As long as the corners are believed less than stated (``setup.tempering``), what they show besides is no more than
-    usual: it would be the distortion that the model does not have yet.
+    usual: it would be the distortion that the model does not have yet. Nor is it where a residual field has been taken
+    off: what a field of limited strength leaves would pass for drift and for lattices that are stretched, by so much
+    that tilts make room for them.
     """
     found = _updated_components(setup, problem, result)
-    return found if setup.tempering == 1.0 else limit_components(setup, found)
+    limited = setup.corrected or setup.tempering != 1.0
+    return limit_components(setup, found) if limited else found
 
 
 def limit_components(setup: Setup, found: VarianceComponents) -> VarianceComponents:
