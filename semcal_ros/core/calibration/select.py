@@ -88,8 +88,6 @@ _GAIN_PER_COEFFICIENT = 1.0
 # That of a term that is not there yet: by chance in one of 600 terms that are not needed, as the chance of a chi-square
 # of one degree of freedom above 10.
 _GAIN_OF_TERM = 5.0
-# What a camera need not have.
-_TERMS = tuple(name for name in TERM_NAMES if name not in SMOOTH)
 # Most coefficients of a function of the scan: coils and settling hardly change with the magnification.
 _MAX_SCAN_SIZE = 3
 # Gain in half chi-squares by which a choice must be better to replace the previous one.
@@ -338,13 +336,7 @@ def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, 
             break
         level, noisy = excess, tempered(setup, excess)
         spread = update_components(noisy, adjustment.problem, adjustment.result)
-        adjustment = select_and_adjust(
-            noisy,
-            adjustment.functions,
-            adjustment.result.state,
-            spread,
-            free_rounds=_FREE_ROUNDS if noisy.tempering == 1.0 else 0,
-        )
+        adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
     return noisy, adjustment
 
 
@@ -356,24 +348,22 @@ def select_and_adjust(
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
     choose_terms: bool = True,
-    free_rounds: int = 0,
 ) -> Adjustment:
     """Choose the number of coefficients of every function, and further terms of the camera, until the choice no longer
     changes.
 
-    In the first ``free_rounds`` the choice before, ``sizes`` or that of the last round, has no right to stay. Beside a
-    residual field the terms stay as they are, since it takes the place of those that are not there.
+    Beside a residual field the terms stay as they are, since it takes the place of those that are not there.
     """
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
-    terms = () if setup.priors.is_wide or not choose_terms else _TERMS
+    terms = () if setup.priors.is_wide or not choose_terms else TERM_NAMES
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=terms)
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
-        kept = None if rounds <= free_rounds else sizes
+        kept = None if setup.tempering == 1.0 and rounds <= _FREE_ROUNDS else sizes
         chosen = select_functions(summary, setup, functions, SMOOTH, terms, kept)
         if chosen == sizes:
             result, count = adjust_with_other_poses(setup, functions, spread, problem, result.state)

@@ -464,9 +464,9 @@ def variance_factor(problem: Problem, result: BundleResult) -> float:
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))
 
 
-SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "xi_u", "ex", "ey")
-"""The functions that may change with the magnification and are always adjusted: decentring in any direction, so that a
-picture that is mirrored or turned gives the same camera."""
+SMOOTH = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+"""The functions that may change with the magnification and are always adjusted. With the other decentring among them,
+wrong tilts are explained from the start: of 40 microscopes of a fleet, one came out wrong by 12 sigmas."""
 
 
 @dataclass(frozen=True)
