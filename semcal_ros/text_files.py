@@ -24,8 +24,6 @@ from pathlib import Path
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.core.wording import did_you_mean
 
-__all__ = ["CONSTRUCTOR_ERRORS", "read_text_file"]
-
 CONSTRUCTOR_ERRORS = (
     ValueError,
     TypeError,

@@ -37,10 +37,13 @@ import numpy as np
 
 from benchmarks.table import quick_from_command_line, show
 from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe, patches
-from semcal_ros.applications.reconstruction.appearance import compute_log_grey, prepare_appearance
+from semcal_ros.applications.reconstruction.appearance import (
+    Shading,
+    compute_log_grey,
+    prepare_appearance,
+)
 from semcal_ros.applications.reconstruction.feature_tracks import project_to_plane
 from semcal_ros.applications.reconstruction.patches import PatchSettings, PosedSurface
-from semcal_ros.applications.reconstruction.shading import Shading
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.specimens.ball import (
     BallOnTip,

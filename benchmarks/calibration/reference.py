@@ -27,7 +27,7 @@ import numpy as np
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import Detector, VirtualMicroscope
-from semcal_ros.synthetic.laws import Constant, Law
+from semcal_ros.synthetic.microscope import Constant, Law
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.grid import ChessGrid, square_for

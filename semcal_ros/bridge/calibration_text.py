@@ -21,8 +21,6 @@ from typing import Any
 from semcal_ros.bridge.fields import require_fields
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
-__all__ = ["MAX_TEXT_BYTES", "calibration_text_from_message", "fill_calibration_text"]
-
 # A file's size grows with the square of its coefficients, 49 MB for 3000; ours have a few hundred,
 # so about 0.5 MB.
 MAX_TEXT_BYTES = 16 * 1024 * 1024

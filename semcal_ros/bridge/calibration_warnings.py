@@ -21,8 +21,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["SCALE_PREFIX", "ScaleWarnings", "read_scale_warnings"]
-
 SCALE_PREFIX = "scale:"
 """Begin of the warnings that judge nm per pixel."""
 
@@ -52,10 +50,10 @@ class ScaleWarnings:
         """How many there are, and the beginning of the first one; empty without any."""
         if not self.count:
             return ""
-        told = "a warning" if self.count == 1 else f"{self.count} warnings, the first"
+        counted = "a warning" if self.count == 1 else f"{self.count} warnings, the first"
         # Conditions are told apart by semicolons.
         first = _cut(self.texts[0], _SHORT).replace(";", ",")
-        return f"scale of the calibration: {told}: {first}"
+        return f"scale of the calibration: {counted}: {first}"
 
     @property
     def details(self) -> str:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""sensor_msgs/msg/CameraInfo of rectified images (design section 9)."""
+"""sensor_msgs/msg/CameraInfo of rectified images: see ``doc/model.md``, "Square pixels"."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 if TYPE_CHECKING:  # its fit needs scipy.optimize, which takes long to import
     from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
 
-__all__ = ["fill_camera_info", "fill_raw_camera_info"]
 
 # Matrices of three rows, row by row.
 _ZEROS: list[float] = [0.0] * 9

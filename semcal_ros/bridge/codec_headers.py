@@ -33,8 +33,6 @@ from dataclasses import dataclass
 
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["MAX_PIXELS", "CodecHeader", "read_codec_header"]
-
 MAX_PIXELS = 2**28
 """Largest accepted image: 16384 x 16384, the largest frame of common scan generators; 512 MB at 16 bit."""
 

@@ -37,14 +37,6 @@ from semcal_ros.bridge.images import ENCODINGS, image_from_message
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.core.wording import did_you_mean
 
-__all__ = [
-    "CODECS",
-    "decoded_image",
-    "describe_compressed",
-    "fill_compressed",
-    "image_from_compressed",
-]
-
 CODECS = {"png": ("mono8", "mono16", "bgr8", "rgb8"), "jpeg": ("mono8", "bgr8", "rgb8")}
 """Codecs and the encodings that each carries; PNG without loss."""
 

@@ -22,8 +22,6 @@ from typing import Any
 
 from semcal_ros.bridge.fields import new_nested, require_fields
 
-__all__ = ["CONDITIONS_TYPE", "NUMBERS", "TEXTS", "fill_conditions", "read_conditions"]
-
 NUMBERS = (
     "accelerating_voltage_v",
     "working_distance_m",

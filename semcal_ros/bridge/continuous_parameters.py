@@ -25,16 +25,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "PARAMETER_KINDS",
-    "CameraSource",
-    "ParameterRequest",
-    "continuous_value",
-    "is_continuous_parameter",
-    "parse_parameter_name",
-    "read_parameter",
-]
-
 PARAMETER_KINDS = (
     *("p", "k", "d", "e", "p_affine", "p_affine_covariance"),
     *("pixel_size", "sigma"),

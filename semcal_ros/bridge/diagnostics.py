@@ -25,15 +25,6 @@ from typing import Any
 from semcal_ros.bridge.fields import new_nested
 from semcal_ros.core.arrays import check_positive
 
-__all__ = [
-    "DiagnosticLevel",
-    "DiagnosticSummary",
-    "StreamStatistics",
-    "fill_diagnostic_status",
-    "join_states",
-    "split_states",
-]
-
 _BETWEEN = "; "
 
 

@@ -30,13 +30,6 @@ from semcal_ros.core.errors import InvalidValueError
 if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which most nodes do not
     from semcal_ros.core.drift.estimates import DriftEstimate
 
-__all__ = [
-    "UNKNOWN_VARIANCE",
-    "fill_drift",
-    "fill_drift_velocity",
-    "rotation_of",
-    "rotation_rate_of",
-]
 
 # Standard deviations of 1 km and of 1000 rad.
 UNKNOWN_VARIANCE = 1e6

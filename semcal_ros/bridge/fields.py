@@ -25,15 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.errors import MessageError
 
-__all__ = [
-    "assign_bytes",
-    "assign_floats",
-    "byte_memory",
-    "new_nested",
-    "require_fields",
-    "whole_number",
-]
-
 
 def require_fields(message: Any, names: tuple[str, ...], type_name: str) -> None:
     """Raise :class:`MessageError` if ``message`` is not of type ``type_name``."""

@@ -21,16 +21,6 @@ from typing import Any, Protocol
 from semcal_ros.bridge.fields import whole_number
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
-__all__ = [
-    "HeaderMessage",
-    "StampMessage",
-    "copy_header",
-    "fill_header",
-    "fill_stamp",
-    "optional_stamp_ns",
-    "stamp_ns_from_msg",
-]
-
 _NS_PER_S = 1_000_000_000  # nanoseconds per second
 _SEC_MIN, _SEC_MAX = -(2**31), 2**31 - 1
 

@@ -29,16 +29,6 @@ from semcal_ros.bridge.fields import byte_memory, require_fields, whole_number
 from semcal_ros.bridge.headers import HeaderMessage, copy_header
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
-__all__ = [
-    "ENCODINGS",
-    "PixelFormat",
-    "fill_image",
-    "image_from_message",
-    "pixel_memory",
-    "to_gray",
-    "without_databar",
-]
-
 
 class PixelFormat(NamedTuple):
     """Array type of an encoding."""

@@ -16,7 +16,7 @@
 
 With display width D of the calibration and field width W, the magnification is ``g = D / W``. A
 pixel size p over an image of n pixels means ``W = n p``; a magnification g' that refers to another
-display width D' means ``W = D' / g'`` (design section 3).
+display width D' means ``W = D' / g'``. Why a magnification alone says little: ``doc/conventions.md``.
 """
 
 from __future__ import annotations
@@ -30,14 +30,6 @@ from typing import Any
 from semcal_ros.bridge.headers import optional_stamp_ns
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, MessageError
-
-__all__ = [
-    "MAGNIFICATION_LIMITS",
-    "MagnificationReading",
-    "check_magnification",
-    "published_number",
-    "read_magnification",
-]
 
 MAGNIFICATION_LIMITS = (1.0, 1e8)
 """No SEM shows less than life size; at the upper limit a display of 0.12 m would show 1.2 nm."""

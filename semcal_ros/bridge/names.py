@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["absolute_namespace"]
-
 
 def absolute_namespace(namespace: str) -> str:
     """Return a namespace such as ``sem/left/`` in the form ``/sem/left``.

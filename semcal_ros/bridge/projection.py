@@ -34,17 +34,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError
 
-__all__ = [
-    "fill_projection",
-    "fill_projection_covariance",
-    "fill_stamped_projection",
-    "fill_stamped_projection_covariance",
-    "projection_covariance_from_message",
-    "projection_from_message",
-    "stamped_projection_covariance_from_message",
-    "stamped_projection_from_message",
-]
-
 _STAMPED_ENCODING = "64FC1"
 _STAMPED_ENCODINGS = {_STAMPED_ENCODING: PixelFormat(np.dtype(np.float64), 1)}
 

@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from semcal_ros.config.config import MicroscopeConfig
 
-__all__ = ["scan_interval_ns"]
-
 _NS_PER_S = 1_000_000_000  # nanoseconds per second
 # Fraction of the acquisition at either end in which a change is harmless: a row or two at most.
 _MARGIN = 0.01

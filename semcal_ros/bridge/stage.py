@@ -25,8 +25,6 @@ from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import MessageError
 
-__all__ = ["doubt_unit", "missing_joints", "read_stage", "require_radians", "tilt_jump_rad"]
-
 # A specimen that is tilted by a right angle is seen edge-on; some stages reach a degree or so more.
 _MAX_TILT_RAD = 1.6
 # No stage turns further than twice round, and angles of a scan end at half a turn or a turn.

@@ -25,8 +25,6 @@ from semcal_ros.bridge.headers import fill_stamp
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["StaticFrame", "fill_static_frames", "static_frames"]
-
 _ROOT = "sem"
 
 

@@ -21,8 +21,6 @@ from typing import Generic, TypeVar
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["ZeroOrderHold"]
-
 T = TypeVar("T")
 
 _NS_PER_S = 1_000_000_000  # nanoseconds per second

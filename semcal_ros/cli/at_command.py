@@ -36,8 +36,6 @@ from semcal_ros.core.camera.uncertainty_budget import (
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.workflows.describe_camera import describe_camera
 
-__all__ = ["command"]
-
 
 @click.command("at")
 @click.argument("calibration", type=PATH)

@@ -43,8 +43,6 @@ from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import check
 from semcal_ros.workflows.check_specimen import STAGE_ACCURACY, MovesCheck, check_specimen
 
-__all__ = ["command", "echo_check"]
-
 _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
 
 

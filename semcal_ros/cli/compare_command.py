@@ -31,8 +31,6 @@ from semcal_ros.core.calibration.judgement.compare import (
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
 
-__all__ = ["command"]
-
 _COLUMNS = (
     "magnification",
     "nm_per_px",

@@ -28,8 +28,6 @@ from semcal_ros.cli.output import show_progress
 from semcal_ros.cli.view_command import require_view
 from semcal_ros.core.errors import SemcalError
 
-__all__ = ["command"]
-
 # Views of the grid for the calibration: some seconds of work, good to a few tenths of a per cent.
 _MAGNIFICATIONS = (1500.0, 2200.0, 3200.0, 4700.0, 6800.0, 9000.0)
 _VIEWS, _VIEW_SIZE = 4, 320

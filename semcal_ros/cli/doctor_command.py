@@ -26,12 +26,9 @@ from semcal_ros.cli.options import PATH, Quantity, config_option
 from semcal_ros.cli.output import echo_json
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import diagnose
-from semcal_ros.doctor.findings import Finding, Severity
-from semcal_ros.doctor.legend import explain_figures
+from semcal_ros.doctor.findings import Finding, Severity, explain_figures
 from semcal_ros.doctor.recording import diagnose_recording
 from semcal_ros.files.images.image_series import refuse_images
-
-__all__ = ["command"]
 
 _ORDER = (Severity.PROBLEM, Severity.NOTE, Severity.OK)
 

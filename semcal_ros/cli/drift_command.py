@@ -43,8 +43,6 @@ from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.drift_video import write_drift_video
 from semcal_ros.workflows.track_drift import describe_forecast, describe_rate, track_drift
 
-__all__ = ["command"]
-
 
 @click.command("drift")
 @recording_input

@@ -37,8 +37,6 @@ from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.evaluate import evaluate
 
-__all__ = ["command"]
-
 
 @click.command("evaluate")
 @click.argument("calibration", type=PATH)

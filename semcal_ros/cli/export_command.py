@@ -26,8 +26,6 @@ from semcal_ros.cli.options import PATH
 from semcal_ros.cli.output import echo_notes
 from semcal_ros.workflows.export_camera import EXPORT_FORMATS, LOSSY_PX, export_calibration
 
-__all__ = ["command"]
-
 # Above this, the difference is told as a note: a tenth of a pixel is what users of such files see.
 _TOLD_PX = 0.1
 

@@ -26,8 +26,6 @@ from semcal_ros.core.calibration.start import UNTILTED_MODES
 from semcal_ros.core.corners import PATTERNS
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["grid_options", "refuse_grid_options"]
-
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 

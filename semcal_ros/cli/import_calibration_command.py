@@ -26,8 +26,6 @@ from semcal_ros.cli.output import echo_verdict
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.import_calibration import import_calibration
 
-__all__ = ["command"]
-
 
 def _parse_size(_context: click.Context, _parameter: click.Parameter, text: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d+)\s*[x×,]\s*(\d+)", text.strip())

@@ -27,8 +27,6 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.files.images.to_bag import import_images
 from semcal_ros.files.recordings import RecordedFiles
 
-__all__ = ["command"]
-
 
 @click.command("import")
 @recording_input

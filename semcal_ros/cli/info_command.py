@@ -39,9 +39,6 @@ from semcal_ros.workflows.describe_recording import (
     describe_recording,
 )
 
-__all__ = ["command"]
-
-
 # A sweep has as many magnifications as frames: of more than this, the middle ones are left out.
 _MOST_ROWS = 24
 
@@ -107,20 +104,23 @@ def _anchor_row(ladder: dict[str, Any] | None, method: str) -> list[tuple[str, s
 
 
 def _echo_calibration(known: Mapping[str, Any]) -> None:
-    def told(name: str, show: Callable[[Any], str] = str) -> str:
+    def show_known(name: str, show: Callable[[Any], str] = str) -> str:
         value = known[name]
         return NOT_RECORDED if value is None else show(value)
 
     low, high = known["magnification_range"]
     rows = [
         ("method", known["method"]),
-        ("calibrated", told("calibrated", "{} UTC".format)),
-        ("software", told("software_version", "semcal_ros {}".format)),
-        ("recording", told("recording")),
-        ("  SHA-256", told("recording_sha256")),
-        ("  recorded", told("recorded", lambda dates: " to ".join(dict.fromkeys(dates)) + " UTC")),
-        ("configuration", told("configuration")),
-        ("  SHA-256", told("configuration_sha256")),
+        ("calibrated", show_known("calibrated", "{} UTC".format)),
+        ("software", show_known("software_version", "semcal_ros {}".format)),
+        ("recording", show_known("recording")),
+        ("  SHA-256", show_known("recording_sha256")),
+        (
+            "  recorded",
+            show_known("recorded", lambda dates: " to ".join(dict.fromkeys(dates)) + " UTC"),
+        ),
+        ("configuration", show_known("configuration")),
+        ("  SHA-256", show_known("configuration_sha256")),
         (
             "range",
             f"{low:g}x to {high:g}x, {counted(len(known['magnifications']), 'magnification')}",
@@ -128,11 +128,11 @@ def _echo_calibration(known: Mapping[str, Any]) -> None:
         *_anchor_row(known["ladder"], known["method"]),
         ("image", f"{known['image_width_px']} x {known['image_height_px']} px"),
         ("display width", f"{known['display_width_m']:g} m"),
-        ("squares", told("squares_m", lambda s: ", ".join(f"{1e6 * v:g} um" for v in s))),
-        ("certificate", told("grid_certificate")),
-        ("views", told("views_used")),
-        ("corners", told("corners")),
-        ("RMS", told("rms_px", lambda v: f"{v:.4f} px")),
+        ("squares", show_known("squares_m", lambda s: ", ".join(f"{1e6 * v:g} um" for v in s))),
+        ("certificate", show_known("grid_certificate")),
+        ("views", show_known("views_used")),
+        ("corners", show_known("corners")),
+        ("RMS", show_known("rms_px", lambda v: f"{v:.4f} px")),
     ]
     if known["conditions"] is None:
         rows.append(("conditions", NOT_RECORDED))

@@ -27,8 +27,6 @@ from semcal_ros.core.errors import SemcalError, UnusableCalibrationError
 from semcal_ros.core.wording import did_you_mean
 from semcal_ros.middleware.ament_prefix import add_environment_prefix
 
-__all__ = ["main"]
-
 # Modules are imported when their command is used, so that `semcal --help` does not wait for plotting or bags.
 _COMMANDS = {
     "acquire": "calibrate a live microscope unattended, or step by step",

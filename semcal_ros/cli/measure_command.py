@@ -33,8 +33,6 @@ from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.measure_cantilever import CantileverMeasurement, measure_cantilever
 
-__all__ = ["command"]
-
 if TYPE_CHECKING:
     PairParam = click.ParamType[tuple[float, float]]
 else:

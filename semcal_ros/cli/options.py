@@ -26,29 +26,6 @@ import click
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tiff.values import angle_in_degrees, plain_number, quantity
 
-__all__ = [
-    "DURATION",
-    "FIGURE_SUFFIXES",
-    "LENGTH",
-    "LENGTH_OR_ZERO",
-    "PATH",
-    "Quantity",
-    "calibration_option",
-    "config_option",
-    "dask_option",
-    "interpolation_option",
-    "json_option",
-    "no_drift_option",
-    "output_option",
-    "overwrite_option",
-    "parse_angle",
-    "parse_lengths",
-    "parse_ratio",
-    "parse_tilts",
-    "require_folder",
-    "squares_option",
-]
-
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 

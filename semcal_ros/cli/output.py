@@ -35,19 +35,6 @@ if TYPE_CHECKING:
     from semcal_ros.core.calibration.views import RejectedView
     from semcal_ros.core.camera.calibration_model import CalibrationModel
 
-__all__ = [
-    "echo_json",
-    "echo_nominal_unit",
-    "echo_notes",
-    "echo_paths",
-    "echo_rejected",
-    "echo_states",
-    "echo_table",
-    "echo_term_sizes",
-    "echo_verdict",
-    "list_rejections",
-    "show_progress",
-]
 
 # Rejected views that are named for each kind of reason; the report shows all.
 _MOST_NAMED = 5

@@ -43,8 +43,6 @@ from semcal_ros.core.ladder.plan import PlannedStep, plan_ladder
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
 
-__all__ = ["command"]
-
 
 def _parse_magnification(
     _context: click.Context, _parameter: click.Parameter, text: str | None

@@ -25,8 +25,6 @@ import click
 from semcal_ros.cli.options import config_option
 from semcal_ros.core.errors import SemcalError
 
-__all__ = ["command"]
-
 
 @click.command("play")
 @click.argument("recording", type=click.Path(path_type=Path))

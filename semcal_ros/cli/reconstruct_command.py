@@ -42,8 +42,6 @@ from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.workflows.measure_relief import RELIEF_SUFFIXES, measure_relief
 from semcal_ros.workflows.reconstruct import reconstruct
 
-__all__ = ["command"]
-
 
 @click.command("reconstruct")
 @recording_input
@@ -165,7 +163,7 @@ def command(
         done.save_cloud(cloud, unit=unit)
     if figure is not None:
         # Imported here, so that a run without a figure does not wait for matplotlib.
-        from semcal_ros.report.ball_figures import write_ball_figure
+        from semcal_ros.report.reconstruction_figures import write_ball_figure
 
         with show_progress("drawing"):
             write_ball_figure(done.structure, done.ball, figure)
@@ -215,7 +213,7 @@ def _measure_relief(
         done.save(cloud, unit=unit)
     if figure is not None:
         # Imported here, so that a run without a figure does not wait for matplotlib.
-        from semcal_ros.report.relief_figures import write_relief_figure
+        from semcal_ros.report.reconstruction_figures import write_relief_figure
 
         with show_progress("drawing"):
             write_relief_figure(done.heights, figure)

@@ -31,17 +31,6 @@ from semcal_ros.files.images.image_file import is_image_file
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import resolve_config
 
-__all__ = [
-    "PIXEL_SIZE_AT",
-    "PixelSizeAt",
-    "check_outputs",
-    "check_spared",
-    "optional_recording_input",
-    "recording_input",
-    "recordings_input",
-    "refuse_mask",
-]
-
 Command = TypeVar("Command", bound=Callable[..., Any])
 Output = tuple[str, Path | None, Sequence[str]]
 
@@ -216,8 +205,10 @@ def _reading(command: Command, *, several: bool, required: bool = True) -> Comma
         ]
         if display_width is not None:
             microscope = replace(microscope, display_width_m=display_width)
-        own = {"recordings": given} if several else {"recording": given[0] if given else None}
-        return command(config=microscope, **own, **others)
+        recordings = (
+            {"recordings": given} if several else {"recording": given[0] if given else None}
+        )
+        return command(config=microscope, **recordings, **others)
 
     name = "RECORDINGS..." if several else "RECORDING" if required else "[RECORDING]"
     decorated: Any = read

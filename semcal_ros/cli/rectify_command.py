@@ -34,8 +34,6 @@ from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.rectify import rectify
 
-__all__ = ["command"]
-
 
 @click.command("rectify")
 @recording_input

@@ -41,8 +41,6 @@ from semcal_ros.synthetic import (
 )
 from semcal_ros.workflows.simulate import MOST_FRAMES, MOST_VIEWS, PLAN_KINDS, simulate
 
-__all__ = ["command"]
-
 
 def _ratio_option(*names: str, default: str, text: str) -> Callable[[Command], Command]:
     """Return an option that takes a ratio such as ``0.1%``."""

@@ -47,8 +47,6 @@ from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.stack import StackResult, stack
 
-__all__ = ["command"]
-
 # 1-sigma of the drift beyond which the average is visibly blurred, px.
 _UNKNOWN_PX = 1.0
 

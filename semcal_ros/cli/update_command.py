@@ -30,8 +30,6 @@ from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import update
 
-__all__ = ["command"]
-
 
 @click.command("update")
 @click.argument("calibration", type=PATH)

@@ -33,8 +33,6 @@ from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import open_source, resolve_calibration, resolve_config
 
-__all__ = ["command", "require_view"]
-
 _TOKEN = "SEMCAL_VIEW_TOKEN"
 
 

@@ -33,8 +33,6 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 
-__all__ = ["open_frames"]
-
 
 def open_frames(
     source: Source,

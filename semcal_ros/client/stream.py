@@ -38,8 +38,6 @@ from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo
 from semcal_ros.nodes.frames.stream import FrameInput, StreamFrame
 
-__all__ = ["CalibratedStream"]
-
 # Frames that wait for their other parts: more than the queues of all inputs hold.
 _WAITING = 16
 # Seconds between looks at the publishers.

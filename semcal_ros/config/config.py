@@ -37,8 +37,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from semcal_ros.config.files import config_names, find_config_file, read_config_text
-from semcal_ros.config.yaml_text import load_yaml
+from semcal_ros.config.files import config_names, find_config_file, load_yaml, read_config_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.core.wording import did_you_mean

@@ -32,25 +32,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "MEDIAN_CHI2",
-    "MEDIAN_CHI2_2",
-    "RESAMPLED_TYPES",
-    "AnyImage",
-    "Array",
-    "Array32",
-    "Image",
-    "Indices",
-    "Mask",
-    "check_image",
-    "check_positive",
-    "check_range",
-    "equilibrate",
-    "invert_scaled",
-    "mad_sigma",
-    "solve_scaled",
-]
-
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -25,24 +25,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeVar
 
-__all__ = [
-    "BagError",
-    "CalibrationError",
-    "CalibrationFileError",
-    "ConfigError",
-    "InvalidValueError",
-    "MessageError",
-    "MicroscopeError",
-    "Rejection",
-    "SemcalError",
-    "StructureError",
-    "TiffError",
-    "UnknownScaleError",
-    "UnusableCalibrationError",
-    "UnusableFrameError",
-]
-
-
 Status = TypeVar("Status", bound=Enum)
 
 

@@ -22,17 +22,6 @@ import unicodedata
 from collections.abc import Callable, Iterable
 from typing import SupportsIndex
 
-__all__ = [
-    "counted",
-    "did_you_mean",
-    "group_by_kind",
-    "in_nm",
-    "nearest_name",
-    "omit_numbers",
-    "printable",
-    "rounded_magnification",
-]
-
 _NUMBER = re.compile(r"-?\d[\d.]*")
 
 

@@ -23,8 +23,6 @@ from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import CalibrationSeen, Session
 
-__all__ = ["check_calibration", "describe_calibration", "live_size"]
-
 # One row in a thousand: the change of shape when a scaled size is rounded.
 _ASPECT = 1e-3
 
@@ -136,8 +134,8 @@ def _size(seen: CalibrationSeen, size: tuple[int, int] | None) -> list[Finding]:
 
 def _display(seen: CalibrationSeen, config: MicroscopeConfig) -> list[Finding]:
     source = config.magnification
-    own = source.quantity != "magnification" or source.display_width_m is not None
-    if own or abs(config.display_width_m / seen.display_width_m - 1.0) < 1e-6:
+    is_independent = source.quantity != "magnification" or source.display_width_m is not None
+    if is_independent or abs(config.display_width_m / seen.display_width_m - 1.0) < 1e-6:
         return []
     return [
         note(

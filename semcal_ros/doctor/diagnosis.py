@@ -27,8 +27,12 @@ from semcal_ros.doctor.calibration_checks import (
     describe_calibration,
     live_size,
 )
-from semcal_ros.doctor.environment import collect_environment
-from semcal_ros.doctor.environment_checks import ENVIRONMENT_CHECKS, check_domain, check_rclpy
+from semcal_ros.doctor.environment_checks import (
+    ENVIRONMENT_CHECKS,
+    check_domain,
+    check_rclpy,
+    collect_environment,
+)
 from semcal_ros.doctor.findings import Finding, Severity, note, problem
 from semcal_ros.doctor.graph_checks import (
     CONDITIONS,
@@ -52,8 +56,6 @@ from semcal_ros.doctor.stream_checks import (
     check_transport_time,
     describe_magnifications,
 )
-
-__all__ = ["diagnose", "evaluate", "judge_calibrations"]
 
 
 def diagnose(

@@ -12,11 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Checks of the machine, of Python, and of how ROS 2 is set up here."""
+"""The machine, Python, and how ROS 2 is set up here: what is collected of them, and its checks; works without ROS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from importlib import import_module, metadata
 from pathlib import Path
 
 from packaging.requirements import InvalidRequirement, Requirement
@@ -26,27 +32,13 @@ from packaging.version import InvalidVersion
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Environment
-from semcal_ros.middleware.fastdds_profile import (
+from semcal_ros.middleware.ament_prefix import prefixes_of_user
+from semcal_ros.middleware.transport_advice import (
     SharedMemory,
     local_only,
     profile_file,
     shared_memory,
 )
-
-__all__ = [
-    "ENVIRONMENT_CHECKS",
-    "check_discovery",
-    "check_domain",
-    "check_one_ros",
-    "check_package_index",
-    "check_packages",
-    "check_profile",
-    "check_python",
-    "check_rclpy",
-    "check_rmw",
-    "check_shared_memory",
-    "check_socket_buffers",
-]
 
 _PYTHON = ((3, 10), (3, 14))  # as in the Makefile
 _GET_ROS = (
@@ -61,6 +53,18 @@ _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 # What the shipped profile asks of a socket: one frame of 4096 x 4096 with 16 bits.
 _SOCKET_BYTES = 32 * 1024**2
 _MB = 1024**2  # bytes per MiB
+_MESSAGES = ("sensor_msgs.msg", "std_srvs.srv", "diagnostic_msgs.msg")
+_PREFIXES = "AMENT_PREFIX_PATH"
+# Importing rclpy loads the middleware, which may end the process at once: a separate process does it.
+_PROBE = (
+    f"import os, rclpy; print(os.environ.get('{_PREFIXES}', '')); print(rclpy.__file__); "
+    "print(rclpy.get_rmw_implementation_identifier())"
+)
+_PROBE_S = 60.0  # importing rclpy takes about a second; this only ends a process that hangs
+_LONGEST = 200  # characters of a reason, which must fit on one line
+_RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
+_SHM = Path("/dev/shm")
+_INSTALLATIONS = Path("/opt/ros")
 
 
 def check_python(seen: Environment) -> list[Finding]:
@@ -387,3 +391,77 @@ ENVIRONMENT_CHECKS: tuple[Callable[[Environment], list[Finding]], ...] = (
     check_shared_memory,
     check_socket_buffers,
 )
+
+
+def collect_environment() -> Environment:
+    """Collect the state of this machine and process, without a ROS graph; imports what the nodes import."""
+    rclpy_file, rmw, script_prefixes, reason = _probe_ros()
+    distributions = [found for found in metadata.distributions() if found.metadata["Name"]]
+    errors = {"rclpy": reason} if reason else _import_errors(_MESSAGES)
+    return Environment(
+        python=sys.version_info[:2],
+        packages={_name(found): found.version for found in distributions},
+        requirements={_name(found): tuple(found.requires or ()) for found in distributions},
+        import_errors=errors,
+        rclpy_file=rclpy_file,
+        prefix=sys.prefix,
+        installations=tuple(sorted(str(p.parent) for p in _INSTALLATIONS.glob("*/setup.sh"))),
+        environment=dict(os.environ),
+        script_prefixes=tuple(p for p in script_prefixes.split(os.pathsep) if p),
+        rmw=rmw,
+        shm_free_bytes=shutil.disk_usage(_SHM).free if _SHM.is_dir() else None,
+        receive_buffer_bytes=_number_in(_RECEIVE_BUFFER),
+    )
+
+
+def _probe_ros() -> tuple[str, str, str, str]:
+    """File of rclpy, name of the middleware, where scripts look packages up, and, where rclpy cannot be imported, the
+    reason.
+    """
+    # This command has put its own prefix there, which a script of the user's does not do.
+    outer = {**os.environ, _PREFIXES: os.pathsep.join(prefixes_of_user())}
+    command = [sys.executable, "-W", "ignore", "-c", _PROBE]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=_PROBE_S, env=outer
+        )
+    except subprocess.TimeoutExpired:
+        return "", "", "", f"importing it took over {_PROBE_S:g} s"
+    lines = done.stdout.split("\n")
+    if done.returncode == 0 and len(lines) >= 4:
+        return lines[-3], lines[-2], lines[-4], ""
+    said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    reason = said[-1][:_LONGEST] if said else f"the process ended with {done.returncode}"
+    return "", "", "", reason
+
+
+def _import_errors(modules: Iterable[str]) -> dict[str, str]:
+    reasons = {name: _import_error(name) for name in modules}
+    return {name: reason for name, reason in reasons.items() if reason}
+
+
+def _import_error(module: str) -> str:
+    try:
+        with warnings.catch_warnings():
+            # Warnings of other modules at import do not matter here.
+            warnings.simplefilter("ignore")
+            import_module(module)
+    except Exception as error:  # a broken installation may raise any exception
+        return _one_line(error)
+    return ""
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text[:_LONGEST]
+
+
+def _name(distribution: metadata.Distribution) -> str:
+    return canonicalize_name(distribution.metadata["Name"])
+
+
+def _number_in(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None

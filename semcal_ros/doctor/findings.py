@@ -12,14 +12,35 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The findings of checks."""
+"""The findings of checks, and what the figures in them mean."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Finding", "Severity", "note", "ok", "problem"]
+# Words in a finding, and what the figure beside them is.
+_FIGURES = (
+    (" Hz", "Hz: messages per second while this command listened, or in the recording"),
+    (
+        "old when they arrive",
+        "age of frames: from the stamp, the start of the scan, to the arrival; it includes the scan itself",
+    ),
+    (
+        "from publisher to here",
+        "from publisher to here: the transport alone, by the clocks of both",
+    ),
+    (
+        "predicted 1-sigma error",
+        "1-sigma error: standard deviation, by the calibration's covariance, of the pixel to which a point of known"
+        " position is projected; most of it is common to all points of an image and drops out of distances in it",
+    ),
+    (
+        "MiB of shared memory",
+        "shared memory: the segment of each process; larger messages wait for room",
+    ),
+)
 
 
 class Severity(Enum):
@@ -72,3 +93,9 @@ def note(subject: str, seen: str, *, expected: str = "", do: str = "") -> Findin
 def problem(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
     """Make a finding that something cannot work."""
     return Finding(Severity.PROBLEM, subject, seen, expected, do)
+
+
+def explain_figures(findings: Iterable[Finding]) -> list[str]:
+    """Return one sentence for each kind of figure that the findings show."""
+    shown = [str(finding) for finding in findings]
+    return [text for words, text in _FIGURES if any(words in line for line in shown)]

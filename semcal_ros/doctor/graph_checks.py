@@ -25,17 +25,6 @@ from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.doctor.findings import Finding, note, ok, problem
 from semcal_ros.doctor.observations import Endpoint, Graph
 
-__all__ = [
-    "CONDITIONS",
-    "Topic",
-    "check_nodes",
-    "check_parameters",
-    "check_simulated_time",
-    "check_topic",
-    "resolve_topic",
-    "suite_topics",
-]
-
 _IMAGE = "sensor_msgs/msg/Image"
 _CLOCK = "/clock"
 #: What the topic with the operating conditions carries.

@@ -51,8 +51,6 @@ from semcal_ros.doctor.observations import (
 from semcal_ros.doctor.stream_checks import describe_image
 from semcal_ros.middleware.message_types import message_class
 
-__all__ = ["observe"]
-
 # Time for discovery, before which nothing is known.
 _DISCOVERY_S = 1.0
 # Longest wait for the parameter services, and again for their answers: a busy node answers late, a
@@ -63,7 +61,7 @@ _STEP_S = 0.05
 # Messages that may wait while others are handled. Chosen, not measured.
 _DEPTH = 50
 # As many images as tell whether they have a data bar.
-_LOOKED_AT = 2
+_KEPT_IMAGES = 2
 _PARAMETERS = ("use_sim_time", "config")
 
 
@@ -114,7 +112,7 @@ class _Observer:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._arrivals: dict[str, list[Arrival]] = {}
-        self._images: deque[Any] = deque(maxlen=_LOOKED_AT)
+        self._images: deque[Any] = deque(maxlen=_KEPT_IMAGES)
         self._magnification: Any = None
         self._stage: Any = None
         self._conditions: dict[str, float | str] | None = None
@@ -254,14 +252,14 @@ class _Observer:
     # -- graph -------------------------------------------------------------------------------------
 
     def _graph(self) -> Graph:
-        own = self._node.get_fully_qualified_name()
+        this_node = self._node.get_fully_qualified_name()
         names = [
             f"{namespace.rstrip('/')}/{name}"
             for name, namespace in self._node.get_node_names_and_namespaces()
         ]
         known = [name for name, _ in self._node.get_topic_names_and_types()]
         return Graph(
-            nodes=tuple(sorted(name for name in names if name != own)),
+            nodes=tuple(sorted(name for name in names if name != this_node)),
             publishers={name: self._publishers(name) for name in known},
             subscriptions={
                 name: self._endpoints(self._node.get_subscriptions_info_by_topic(name))
@@ -273,7 +271,7 @@ class _Observer:
         return self._endpoints(self._node.get_publishers_info_by_topic(topic))
 
     def _endpoints(self, infos: Iterable[Any]) -> tuple[Endpoint, ...]:
-        own = self._node.get_fully_qualified_name()
+        this_node = self._node.get_fully_qualified_name()
         found = [
             Endpoint(
                 f"{info.node_namespace.rstrip('/')}/{info.node_name}",
@@ -283,7 +281,7 @@ class _Observer:
             )
             for info in infos
         ]
-        return tuple(end for end in found if end.node != own)
+        return tuple(end for end in found if end.node != this_node)
 
     def _ask(self, nodes: tuple[str, ...]) -> dict[str, Any]:
         """Ask for the values of :data:`_PARAMETERS` by node; None for nodes that do not answer."""

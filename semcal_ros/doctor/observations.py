@@ -22,18 +22,6 @@ from dataclasses import dataclass, field
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.core.calibration.stage import StageReading
 
-__all__ = [
-    "SUITE",
-    "Arrival",
-    "CalibrationSeen",
-    "Endpoint",
-    "Environment",
-    "Graph",
-    "ImageSeen",
-    "Session",
-    "Status",
-]
-
 SUITE = (
     "bag_player",
     "calibration_server",

@@ -44,8 +44,6 @@ from semcal_ros.doctor.stream_checks import (
 from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag
 from semcal_ros.files.bags.topics import topic_matches
 
-__all__ = ["diagnose_recording"]
-
 _RECORDING = "the recording"
 _CALIBRATION = "calibration"
 # Bytes of the encapsulation; after it comes the stamp of a message that begins with std_msgs/Header.
@@ -194,9 +192,9 @@ def _with_readings(
             session = replace(session, stage=position)
         except SemcalError as error:
             session = replace(session, stage_trouble=str(error))
-    told = next((messages.get(t.name) for t in topics if t.what == CONDITIONS), None)
-    if told is not None:
+    message = next((messages.get(t.name) for t in topics if t.what == CONDITIONS), None)
+    if message is not None:
         # A recording may redefine the type: then nothing is known.
         with suppress(MessageError):
-            session = replace(session, conditions=read_conditions(told))
+            session = replace(session, conditions=read_conditions(message))
     return session

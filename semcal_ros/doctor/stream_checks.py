@@ -36,22 +36,6 @@ from semcal_ros.doctor.observations import Arrival, ImageSeen, Session
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.transport_advice import transport_advice
 
-__all__ = [
-    "MagnificationSeen",
-    "check_conditions",
-    "check_diagnostics",
-    "check_images",
-    "check_large_images",
-    "check_magnification",
-    "check_output_rate",
-    "check_stage",
-    "check_stamps",
-    "check_transport_time",
-    "describe_image",
-    "describe_magnifications",
-    "rate_hz",
-]
-
 # A stamp that differs by more is from another clock, such as a recording's.
 _OTHER_CLOCK_S = 3600.0
 # Clocks that NTP synchronises on one network agree much better.

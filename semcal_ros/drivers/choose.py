@@ -28,8 +28,6 @@ from semcal_ros.drivers.openfibsem import OpenFibsemSource, require_fibsem
 from semcal_ros.drivers.source import FrameSource
 from semcal_ros.drivers.video import SideFile, VideoSource
 
-__all__ = ["SOURCES", "Settings", "make_source"]
-
 
 class Settings(Protocol):
     """Values of the parameters of the node, by name."""
@@ -80,8 +78,8 @@ def _make_video(config: MicroscopeConfig, settings: Settings) -> FrameSource:
     side = SideFile(Path(file).expanduser(), config.display_width_m) if file else None
 
     def field_width_m() -> float | None:
-        told_m = None if side is None else side.field_width_m()
-        return told_m or settings["field_width_m"] or None
+        stated_m = None if side is None else side.field_width_m()
+        return stated_m or settings["field_width_m"] or None
 
     return VideoSource(settings["video"], field_width_m, form=settings["video_format"])
 

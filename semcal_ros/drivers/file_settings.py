@@ -21,8 +21,6 @@ from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.files.tiff.sem_image import VendorSettings
 
-__all__ = ["file_conditions", "file_stage"]
-
 # What two numbers of one angle may differ by, and what counts as not rotated: rounding of a file's text.
 _TURNED_RAD = 1e-3
 

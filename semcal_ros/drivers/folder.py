@@ -37,9 +37,7 @@ from semcal_ros.drivers.file_settings import file_conditions, file_stage
 from semcal_ros.drivers.journal import FileState, Journal
 from semcal_ros.drivers.source import SourceFrame
 from semcal_ros.files.images.image_file import ImagePage, describe_image_file, is_image_file
-from semcal_ros.files.images.video_frames import VIDEO_SUFFIXES
-
-__all__ = ["FolderSource"]
+from semcal_ros.files.video import VIDEO_SUFFIXES
 
 # A file that was closed or renamed into place is most often complete; a program that opens it once more, to append its
 # metadata, does so within milliseconds.
@@ -155,7 +153,7 @@ class FolderSource:
         self._candidates: dict[str, _Candidate] = {}
         self._taken: set[FileState] = set()
         self._frames: deque[SourceFrame] = deque()
-        self._next_look_s = 0.0
+        self._next_scan_s = 0.0
         self._last_stamp_ns = 0
         self._first_rotation_rad: float | None = None
 
@@ -175,7 +173,7 @@ class FolderSource:
             waiting = sum(not self._journal.knows(state) for state in present)
         # What comes from now on is published, whatever happens to the connection.
         self._backlog = "resume"
-        self._next_look_s = 0.0
+        self._next_scan_s = 0.0
         watched = self._watch()
         ahead = f"; {waiting} files to be published first" if waiting else ""
         return f"folder {self._folder}, {watched}{ahead}"
@@ -239,7 +237,7 @@ class FolderSource:
         while True:
             if self._frames:
                 return self._frames.popleft()
-            self._look()
+            self._scan()
             candidate = self._ready()
             if candidate is not None:
                 self._decode(candidate)
@@ -263,7 +261,7 @@ class FolderSource:
 
     def _until_next_s(self) -> float:
         now_s = time.monotonic()
-        times = [self._next_look_s, *(c.next_s for c in self._candidates.values())]
+        times = [self._next_scan_s, *(c.next_s for c in self._candidates.values())]
         return max(min(times) - now_s, 0.005)
 
     def _list(self) -> list[FileState]:
@@ -293,7 +291,7 @@ class FolderSource:
             and any(fnmatch.fnmatch(name, pattern) for pattern in self._patterns)
         )
 
-    def _look(self) -> None:
+    def _scan(self) -> None:
         """Take note of what has changed: of what the system tells at once, of all of it now and then."""
         with self._event:
             touched, self._touched = self._touched, {}
@@ -301,7 +299,7 @@ class FolderSource:
         for name, closed in touched.items():
             if self._counts(name):
                 self._stat(name, closed, now_s)
-        if now_s < self._next_look_s:
+        if now_s < self._next_scan_s:
             return
         states = self._list()
         for state in states:
@@ -310,7 +308,7 @@ class FolderSource:
         for name in self._candidates.keys() - present:
             del self._candidates[name]
         end_s = time.monotonic()
-        self._next_look_s = end_s + max(self._poll_s, (end_s - now_s) / _LOOKING)
+        self._next_scan_s = end_s + max(self._poll_s, (end_s - now_s) / _LOOKING)
 
     def _stat(self, name: str, closed: bool, now_s: float) -> None:
         try:

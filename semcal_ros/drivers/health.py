@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.drivers.source import SourceFrame
 
-__all__ = ["FrameWatch", "is_blank"]
-
 # Rows that are looked at: a blanked beam blanks all of them, and a large image costs no more than a small one.
 _ROWS = 64
 # A blanked beam leaves the dark level and its noise, four grey levels of 8 bit at most; a picture of anything has more,

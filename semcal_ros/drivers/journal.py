@@ -28,8 +28,6 @@ from typing import NamedTuple
 from semcal_ros.core.errors import MicroscopeError
 from semcal_ros.files.atomic import atomic_write_text
 
-__all__ = ["FileState", "Journal", "default_journal"]
-
 # Months of a busy microscope, in 15 MB. Older entries are forgotten when the journal is opened.
 _KEPT = 100_000
 _SECOND_NS = 1_000_000_000

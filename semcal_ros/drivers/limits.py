@@ -23,8 +23,6 @@ from dataclasses import dataclass, field
 from semcal_ros.core.errors import MicroscopeError
 from semcal_ros.drivers.source import JOINTS
 
-__all__ = ["MotionLimits", "describe_target", "joint_unit"]
-
 # Rounding of a position that is asked for at a limit itself.
 _ROUNDING = 1e-9
 
@@ -90,7 +88,7 @@ class MotionLimits:
         self,
         target: Mapping[str, float],
         position: Mapping[str, float],
-        own: Mapping[str, tuple[float, float]],
+        of_microscope: Mapping[str, tuple[float, float]],
     ) -> None:
         """Refuse a move that is too long from where the stage is, or that the microscope itself excludes.
 
@@ -100,7 +98,7 @@ class MotionLimits:
             Where to.
         position
             Where the stage is now.
-        own
+        of_microscope
             Limits of the microscope.
 
         Raises
@@ -109,8 +107,8 @@ class MotionLimits:
             Also where the present position is not known.
         """
         for joint, wanted in target.items():
-            if joint in own:
-                _check_range(joint, wanted, *own[joint], "limits of the microscope", "")
+            if joint in of_microscope:
+                _check_range(joint, wanted, *of_microscope[joint], "limits of the microscope", "")
             now = position.get(joint)
             if now is None or not math.isfinite(now):
                 raise MicroscopeError(

@@ -32,8 +32,6 @@ import numpy as np
 from semcal_ros.core.errors import ConfigError, MicroscopeError
 from semcal_ros.drivers.source import SourceFrame
 
-__all__ = ["MANUFACTURERS", "OpenFibsemSource", "require_fibsem"]
-
 # Class, and port of the server, as fibsem itself chooses them. Its own setup_session is not used: on connecting it sets
 # the beam shift to zero, and nothing is to be changed at a microscope that is only looked at.
 MANUFACTURERS: Mapping[str, tuple[str, str, int]] = {
@@ -177,9 +175,9 @@ class OpenFibsemSource:
             pass_s *= settings.line_integration or 1
         scan_s = None if pass_s is None else pass_s * (settings.frame_integration or 1)
         start_ns = arrived_ns - round((scan_s or 0.0) * 1e9)
-        told_ns = round(float(state.timestamp) * 1e9)
-        if scan_s is not None and 0 < told_ns < arrived_ns - _BEFORE * scan_s * 1e9:
-            start_ns = told_ns
+        stated_ns = round(float(state.timestamp) * 1e9)
+        if scan_s is not None and 0 < stated_ns < arrived_ns - _BEFORE * scan_s * 1e9:
+            start_ns = stated_ns
         pixel_m = None if about.pixel_size is None else _number(about.pixel_size.x)
         data = np.asarray(image.data)
         return SourceFrame(
@@ -268,10 +266,10 @@ class OpenFibsemSource:
         now = self.stage_position()
         for joint, wanted in target.items():
             unit = "m" if joint in ("x", "y", "z") else "rad"
-            miss = abs(now.get(joint, math.inf) - wanted)
-            if unit == "rad" and math.isfinite(miss):
-                miss = abs(math.remainder(miss, 2.0 * math.pi))
-            if miss > _ARRIVED[unit]:
+            off = abs(now.get(joint, math.inf) - wanted)
+            if unit == "rad" and math.isfinite(off):
+                off = abs(math.remainder(off, 2.0 * math.pi))
+            if off > _ARRIVED[unit]:
                 raise MicroscopeError(
                     f"{joint} at {now.get(joint, math.nan):.6g} {unit} after a move to {wanted:.6g}",
                     expected="a stage that arrives",

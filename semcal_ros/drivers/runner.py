@@ -25,8 +25,6 @@ from dataclasses import dataclass
 from semcal_ros.core.errors import MicroscopeError, SemcalError, UnusableFrameError
 from semcal_ros.drivers.source import FrameSource, SourceFrame
 
-__all__ = ["RunnerState", "SourceRunner"]
-
 # How long one call of the source waits for a frame; ~/stop is noticed within this time.
 _READ_S = 0.2
 # A source that has gone away is tried again after these times. The last one repeats: a person who switches the

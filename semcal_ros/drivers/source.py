@@ -22,15 +22,6 @@ from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
-__all__ = [
-    "JOINTS",
-    "ConfirmsFrames",
-    "FrameSource",
-    "MovesStage",
-    "SetsFieldWidth",
-    "SourceFrame",
-]
-
 JOINTS = ("tilt", "rotation", "x", "y", "z", "scan_rotation")
 """Joints of a stage, with the scan rotation; angles in rad, lengths in m."""
 

@@ -28,14 +28,12 @@ import numpy as np
 from semcal_ros.core.errors import MicroscopeError, UnusableFrameError
 from semcal_ros.drivers.source import SourceFrame
 
-__all__ = ["SideFile", "VideoSource"]
-
 # A grabber without a signal, or a stream whose server is gone, is given up after this time.
 _TIMEOUT_S = 5.0
 # From more bits than this a component has grey levels worth 16 bit.
 _BITS_OF_8 = 8
 # How often the side file is looked at: a person who saves it waits no longer than for the next frames.
-_LOOK_S = 0.2
+_EXAMINE_S = 0.2
 # A video file that is played later than this does not hurry to catch up.
 _LATE_S = 1.0
 _LINE = re.compile(r"\s*(?:(magnification|field_width_m)\s*[:=])?\s*([0-9.eE+-]+)\s*(?:#.*)?")
@@ -56,7 +54,7 @@ class SideFile:
     def __init__(self, path: Path, display_width_m: float) -> None:
         self._path = path
         self._display_width_m = display_width_m
-        self._looked_s = -_LOOK_S
+        self._examined_s = -_EXAMINE_S
         self._seen: tuple[int, int] | None = None
         self._width_m: float | None = None
 
@@ -69,9 +67,9 @@ class SideFile:
             It has changed, and holds no magnification. What it said before holds no longer.
         """
         now_s = time.monotonic()
-        if now_s - self._looked_s < _LOOK_S:
+        if now_s - self._examined_s < _EXAMINE_S:
             return self._width_m
-        self._looked_s = now_s
+        self._examined_s = now_s
         try:
             about = self._path.stat()
             seen = about.st_mtime_ns, about.st_size

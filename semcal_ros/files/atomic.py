@@ -23,8 +23,6 @@ import stat
 import tempfile
 from pathlib import Path
 
-__all__ = ["atomic_write_bytes", "atomic_write_text"]
-
 # What open() asks for; the umask takes its bits away.
 _NEW_FILE_MODE = 0o666
 # File systems take names of 255 bytes, and the temporary one is longer than the name itself.

@@ -45,16 +45,6 @@ from semcal_ros.files.atomic import atomic_write_text
 from semcal_ros.files.plain_yaml import load_plain_yaml
 from semcal_ros.text_files import read_text_file
 
-__all__ = [
-    "FILE_VERSION",
-    "format_calibration",
-    "parse_calibration",
-    "read_calibration",
-    "read_calibration_text",
-    "write_calibration",
-]
-
-
 # What is written. Version 1 has no provenance; a file with a number that is not listed is refused.
 FILE_VERSION = 3
 _READ_VERSIONS = (1, 2, FILE_VERSION)
@@ -116,7 +106,7 @@ def format_calibration(model: CalibrationModel) -> str:
     """Format the text of the calibration file, with every number in full precision."""
     field = model.residual
     size = len(model.covariance) - (0 if field is None else field.size)
-    own = model.covariance[:size, :size]
+    of_functions = model.covariance[:size, :size]
     data: dict[str, Any] = {
         "format": _FORMAT,
         "version": FILE_VERSION,
@@ -132,7 +122,7 @@ def format_calibration(model: CalibrationModel) -> str:
         **({} if model.record is None else {"fit_record": _write_record(model.record)}),
         "covariance": {
             "size": size,
-            "upper_rows": [row[i:].tolist() for i, row in enumerate(own)],
+            "upper_rows": [row[i:].tolist() for i, row in enumerate(of_functions)],
         },
     }
     if model.scale_sigma != ScaleSigma():
@@ -269,7 +259,9 @@ def _read_record(data: Mapping[str, Any]) -> FitRecord | None:
     values = dict(data["fit_record"])
     values["squares_m"] = tuple(values.get("squares_m", ()))
     if shares := values.get("scale_shares"):
-        values["scale_shares"] = ScaleShares(**{name: tuple(own) for name, own in shares.items()})
+        values["scale_shares"] = ScaleShares(
+            **{name: tuple(parts) for name, parts in shares.items()}
+        )
     if certificate := values.get("certificate"):
         held = tuple(certificate.get("held", ()))
         values["certificate"] = Certificate(**{**certificate, "held": held})
@@ -369,9 +361,9 @@ def _read_field(data: Mapping[str, Any]) -> ResidualField:
 
 def _write_field(field: ResidualField, covariance: Array) -> dict[str, Any]:
     """``covariance`` holds the rows of the field's coefficients, its last columns being their own."""
-    own = len(covariance)
-    cross, square = np.split(covariance, [covariance.shape[1] - own], axis=1)
-    packed = np.concatenate([cross.ravel(), square[np.triu_indices(own)]])
+    count = len(covariance)
+    cross, square = np.split(covariance, [covariance.shape[1] - count], axis=1)
+    packed = np.concatenate([cross.ravel(), square[np.triu_indices(count)]])
     return {
         "magnification_range": [float(g) for g in field.g_range],
         "knots_x": field.knots_x.tolist(),
@@ -382,10 +374,10 @@ def _write_field(field: ResidualField, covariance: Array) -> dict[str, Any]:
     }
 
 
-def _add_field_covariance(functions: Array, packed: str, own: int) -> Array:
+def _add_field_covariance(functions: Array, packed: str, count: int) -> Array:
     """The covariance of the functions' coefficients and of the field's, from its parts in the file."""
     size = len(functions)
-    expected = own * size + own * (own + 1) // 2
+    expected = count * size + count * (count + 1) // 2
     try:
         values = np.frombuffer(base64.b64decode(packed, validate=True), dtype="<f8")
     except (ValueError, binascii.Error) as error:
@@ -396,12 +388,12 @@ def _add_field_covariance(functions: Array, packed: str, own: int) -> Array:
         raise InvalidValueError(
             f"a covariance of the residual field of {len(values)} numbers", expected=str(expected)
         )
-    whole = np.zeros((size + own, size + own))
+    whole = np.zeros((size + count, size + count))
     whole[:size, :size] = functions
-    whole[size:, :size] = values[: own * size].reshape(own, size)
+    whole[size:, :size] = values[: count * size].reshape(count, size)
     whole[:size, size:] = whole[size:, :size].T
-    square = np.zeros((own, own))
-    square[np.triu_indices(own)] = values[own * size :]
+    square = np.zeros((count, count))
+    square[np.triu_indices(count)] = values[count * size :]
     whole[size:, size:] = square + np.triu(square, 1).T
     _check_covariance(whole)
     return whole

@@ -22,8 +22,6 @@ from pathlib import Path
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["AllowedPaths"]
-
 
 def _resolve(path: str, directory: str = "") -> Path:
     try:

@@ -35,8 +35,6 @@ from semcal_ros.core.arrays import Array32
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 
-__all__ = ["MESH_SUFFIXES", "UNITS_PER_M", "encode_mesh", "save_cloud", "save_mesh"]
-
 MESH_SUFFIXES = (".ply", ".stl")
 UNITS_PER_M: Mapping[str, float] = {"m": 1.0, "um": 1e6, "nm": 1e9}
 

@@ -26,8 +26,6 @@ from semcal_ros.core.errors import ConfigError
 from semcal_ros.files.plain_yaml import load_plain_yaml
 from semcal_ros.text_files import read_text_file
 
-__all__ = ["ParameterSection", "read_parameter_sections"]
-
 _MAX_BYTES = 1024 * 1024  # they are written by hand; this only keeps other files out
 
 

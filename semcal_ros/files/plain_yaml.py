@@ -27,8 +27,6 @@ import yaml
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.text_files import CONSTRUCTOR_ERRORS
 
-__all__ = ["check_plain_yaml", "load_plain_yaml"]
-
 # Calibration files are nested up to 6 deep; 200 000 brackets end the process.
 _MAX_DEPTH = 32
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -43,7 +43,7 @@ from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.conditions import find_conditions
 from semcal_ros.files.bags.errors import reading
-from semcal_ros.files.bags.magnifications import MagnificationTrack
+from semcal_ros.files.bags.held_values import MagnificationTrack
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
 from semcal_ros.files.bags.stage import find_stage
 from semcal_ros.files.bags.topics import find_image_topic, find_topic
@@ -60,16 +60,6 @@ from semcal_ros.files.tiff.sem_image import Conditions
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = [
-    "ENCODINGS",
-    "FrameOutline",
-    "RecordedFiles",
-    "RecordedFrame",
-    "Recording",
-    "RejectedFrame",
-    "open_image_series",
-    "open_recording",
-]
 
 T = TypeVar("T")
 

@@ -27,8 +27,6 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.text_files import read_text_file
 
-__all__ = ["DRIFT_COLUMNS", "SIMILARITY_COLUMNS", "TABLE_SUFFIXES", "read_table", "write_table"]
-
 DRIFT_COLUMNS = (
     "stamp_ns",
     "dx_m",
@@ -50,6 +48,8 @@ Rows = Sequence[Sequence[object]]
 
 # Excel computes with 53 bits: a longer whole number, such as a stamp in ns, keeps its digits as text only.
 _EXCEL_WHOLE = 2**53
+# A table of pixel sizes or drifts has some hundred kilobytes; what is longer is something else.
+_MOST_BYTES = 64 * 2**20
 
 
 def _cell(value: object) -> str:
@@ -153,10 +153,6 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[obje
             do="pip install 'semcal_ros[tables]', or name the table .csv",
         ) from error
     atomic_write_bytes(path, data)
-
-
-# A table of pixel sizes or drifts has some hundred kilobytes; what is longer is something else.
-_MOST_BYTES = 64 * 2**20
 
 
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:

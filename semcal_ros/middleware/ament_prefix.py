@@ -20,8 +20,6 @@ import os
 import sys
 from pathlib import Path
 
-__all__ = ["add_environment_prefix", "prefixes_of_user"]
-
 _VARIABLE = "AMENT_PREFIX_PATH"
 _MARKER = Path("share", "ament_index", "resource_index", "packages", "semcal_ros")
 

@@ -21,8 +21,6 @@ from typing import Any
 
 from semcal_ros.core.errors import ConfigError
 
-__all__ = ["message_class"]
-
 
 def message_class(type_name: str) -> Any:
     """Class of a type such as ``"std_msgs/msg/Float64"``.

@@ -21,8 +21,6 @@ from collections.abc import Mapping
 
 from semcal_ros.core.errors import ConfigError
 
-__all__ = ["check_security"]
-
 
 def check_security(environment: Mapping[str, str] = os.environ) -> None:
     """Refuse settings that ROS would take as no security at all, without a word.

@@ -17,6 +17,11 @@
 A message that fits into the shared memory of its sender goes over at once. A larger one waits for
 room again and again, and meanwhile best-effort messages are lost. ``doc/nodes.md``, "Large images",
 has the measurements.
+
+Of the shared memory, the default is judged, and a profile that states the size of its segment, as the shipped one
+does. The rules for everything else (built-in transports by name, socket buffers) differ between versions of Fast DDS
+and are left to its documentation:
+https://fast-dds.docs.eprosima.com (shared memory transport, XML profiles, environment variables).
 """
 
 from __future__ import annotations
@@ -24,11 +29,12 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
 
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.middleware.fastdds_profile import DEFAULT_SEGMENT_BYTES, shared_memory
-
-__all__ = ["MALLOC_VARIABLES", "transport_advice"]
+from semcal_ros.text_files import read_text_file
 
 MALLOC_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
 """What glibc reads at the start of a process (mallopt(3))."""
@@ -38,6 +44,18 @@ MALLOC_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
 _MALLOC_MATTERS_BYTES = 1024 * 1024
 _REMEDY = "set the environment of `Large images` (doc/nodes.md) for every process with images"
 _OTHER_MALLOC = re.compile("jemalloc|tcmalloc|mimalloc")
+DEFAULT_SEGMENT_BYTES = 512 * 1024
+"""Shared memory of a Fast DDS participant that nobody has configured."""
+
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+"""What names the profile: Fast DDS 2 reads the first alone; Fast DDS 3 reads the second where the first is not set."""
+
+_MAX_PROFILE_BYTES = 1024 * 1024  # the shipped one has 2 kB; this only keeps other files out
+# Folder of each version below an ament prefix, and the profile that it reads in the working directory.
+_VERSIONS = {
+    2: ("fastrtps", "DEFAULT_FASTRTPS_PROFILES.xml"),
+    3: ("fastdds", "DEFAULT_FASTDDS_PROFILES.xml"),
+}
 
 
 def transport_advice(image_bytes: int, environment: Mapping[str, str], rmw: str) -> str:
@@ -76,9 +94,9 @@ def _segment_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
 
 
 def _malloc_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
-    own = "glibc.malloc" in environment.get("GLIBC_TUNABLES", "")
+    tuned = "glibc.malloc" in environment.get("GLIBC_TUNABLES", "")
     other = _OTHER_MALLOC.search(environment.get("LD_PRELOAD", ""))
-    if image_bytes < _MALLOC_MATTERS_BYTES or own or other or not _has_glibc():
+    if image_bytes < _MALLOC_MATTERS_BYTES or tuned or other or not _has_glibc():
         return ""
     small = [name for name in MALLOC_VARIABLES if _number(environment.get(name)) < image_bytes]
     if not small:
@@ -102,3 +120,89 @@ def _number(text: str | None) -> int:
 
 def _size(count: int) -> str:
     return f"{count / 1024**2:.1f} MiB"
+
+
+@dataclass(frozen=True)
+class SharedMemory:
+    """What a Fast DDS participant uses between processes of one machine.
+
+    Attributes
+    ----------
+    segment_bytes
+        Size of its segment; None where the environment does not state it.
+    source
+        What says so, for people.
+    """
+
+    segment_bytes: int | None
+    source: str
+
+
+def profile_file(environment: Mapping[str, str]) -> tuple[str, Path] | None:
+    """What names the profile that Fast DDS reads, and the file; None without one.
+
+    Only what the installed version reads counts, where the ament prefixes tell which version that
+    is. Without a variable, a profile of the fixed name in the working directory counts.
+    """
+    installed = _installed_version(environment)
+    for name in PROFILE_VARIABLES[:1] if installed == 2 else PROFILE_VARIABLES:
+        if environment.get(name):
+            return name, Path(environment[name])
+    if environment.get("SKIP_DEFAULT_XML_FILE", "") != "1":
+        for version, (_, file) in _VERSIONS.items():
+            if installed in (None, version) and Path(file).is_file():
+                return "the working directory", Path(file)
+    return None
+
+
+def _installed_version(environment: Mapping[str, str]) -> int | None:
+    """Major version of the installed Fast DDS, or None where it is not known."""
+    for prefix in filter(None, environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        for version, (folder, _) in _VERSIONS.items():
+            if (Path(prefix) / "share" / folder).is_dir():
+                return version
+    return None
+
+
+def shared_memory(environment: Mapping[str, str]) -> SharedMemory:
+    """The shared memory of a Fast DDS participant started in this environment.
+
+    Raises
+    ------
+    ConfigError
+        The profile cannot be read; Fast DDS goes on without it then.
+    """
+    profile = profile_file(environment)
+    builtin = environment.get("FASTDDS_BUILTIN_TRANSPORTS", "")
+    if profile is not None:
+        return SharedMemory(_largest_segment(profile[1]), str(profile[1]))
+    if builtin:
+        return SharedMemory(None, f"FASTDDS_BUILTIN_TRANSPORTS is {builtin}")
+    ignored = [name for name in PROFILE_VARIABLES if environment.get(name)]
+    source = f"{ignored[0]} is not read by this Fast DDS" if ignored else "no profile is set"
+    return SharedMemory(DEFAULT_SEGMENT_BYTES, source)
+
+
+def local_only(environment: Mapping[str, str]) -> bool:
+    """Whether only nodes on this host are found."""
+    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
+    return reach == "LOCALHOST" or environment.get("ROS_LOCALHOST_ONLY") == "1"
+
+
+def _largest_segment(path: Path) -> int | None:
+    """The largest ``segment_size`` of a profile, bytes; of several segments Fast DDS uses that one."""
+    expected = "the XML of a Fast DDS profile"
+    text = read_text_file(path, _MAX_PROFILE_BYTES, error=ConfigError, expected=expected)
+    # Entities could grow without limit, and a profile has no use for any.
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ConfigError(f"{path}: a document type", expected=expected)
+    try:
+        elements = ElementTree.fromstring(text).iter()
+    except ElementTree.ParseError as error:
+        raise ConfigError(f"{path}: {error}", expected=expected) from error
+    sizes = [
+        (element.text or "").strip()
+        for element in elements
+        if element.tag.rpartition("}")[2] == "segment_size"
+    ]
+    return max((int(size) for size in sizes if size.isdecimal()), default=None)

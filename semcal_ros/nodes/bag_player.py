@@ -183,7 +183,7 @@ class BagPlayer(SemNode):
         self._steps = 0
         self._played = 0
         self._target_ns: int | None = None
-        self._told_s = time.monotonic()
+        self._reported_s = time.monotonic()
         self._make_controls()
         self._announce()
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
@@ -463,17 +463,17 @@ class BagPlayer(SemNode):
             if others
             else None
         )
-        told_s = time.monotonic() - _PROGRESS_S + _IMPATIENT_S
+        reported_s = time.monotonic() - _PROGRESS_S + _IMPATIENT_S
         while not self._ended and (missing := self._missing_subscribers()):
-            if time.monotonic() - told_s >= _PROGRESS_S:
-                told_s = time.monotonic()
+            if time.monotonic() - reported_s >= _PROGRESS_S:
+                reported_s = time.monotonic()
                 self.reporter.info(f"waiting for subscribers: {', '.join(missing)}")
             self._pause_for(_TICK_S)
         if diagnostics is not None:
             self.destroy_subscription(diagnostics)
         with self._changed:
             self._started = True
-            self._told_s = time.monotonic()
+            self._reported_s = time.monotonic()
 
     def _on_diagnostics(self, message: Any) -> None:
         namespace = self.get_namespace().rstrip("/")
@@ -549,9 +549,9 @@ class BagPlayer(SemNode):
             if self._steps:
                 self._steps -= 1
                 self._changed.notify_all()
-            if time.monotonic() - self._told_s < _PROGRESS_S:
+            if time.monotonic() - self._reported_s < _PROGRESS_S:
                 return
-            self._told_s = time.monotonic()
+            self._reported_s = time.monotonic()
             progress = self._progress()
         self.reporter.info(progress)
 

@@ -282,13 +282,13 @@ class ParameterServer(SemNode):
         return super().get_parameter(name)
 
     def get_parameter_type(self, name: str) -> Any:
-        """As for any node."""
+        """Extend the base class: a continuous parameter is an array of doubles, where it has a value."""
         if is_continuous_parameter(name):
             return self._continuous(name).type_.value
         return super().get_parameter_type(name)
 
     def describe_parameter(self, name: str) -> ParameterDescriptor:
-        """As for any node."""
+        """Extend the base class: a continuous parameter is computed, and cannot be set."""
         if not is_continuous_parameter(name):
             return super().describe_parameter(name)
         return ParameterDescriptor(

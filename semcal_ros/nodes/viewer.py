@@ -57,11 +57,17 @@ from semcal_ros.nodes.frames.conditions import ConditionsInput
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedFrame, ViewedImages
-from semcal_ros.viewer.coverage import describe_acquisition, describe_coverage, describe_run
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.server import PageServer
 from semcal_ros.viewer.source import CalibrationPanel, DriftPanel, Status, View
-from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
+from semcal_ros.viewer.state import (
+    DriftTrace,
+    describe_acquisition,
+    describe_coverage,
+    describe_magnification,
+    describe_run,
+    drift_in_pixels,
+)
 
 __all__ = ["Viewer", "give_way", "run_viewer"]
 
@@ -446,9 +452,9 @@ class Viewer(SemNode):
         offer("start", [f"{node}/{verb}" for node in sources for verb in ("start", "resume")])
         offer("stop", [f"{node}/{verb}" for node in sources for verb in ("stop", "pause")])
         offer("reset", [f"{node}/reset" for node in self._images.publishers("corrected")])
-        own = self.get_namespace().rstrip("/")
+        namespace = self.get_namespace().rstrip("/")
         for action, service in _CALIBRATION_ACTIONS.items():
-            offer(action, [f"{own}/{_SERVER}/{service}"])
+            offer(action, [f"{namespace}/{_SERVER}/{service}"])
         self._offered = found
 
     # -- what the page shows -----------------------------------------------------------------------------

@@ -263,7 +263,7 @@ class VirtualSem(SemNode):
             self._joints = self.endpoints.latched_publisher(JointState, self.config.stage.topic)
             self._announce_stage()
         self._conditions = self.endpoints.latched_publisher(DiagnosticStatus, "conditions")
-        self._told: dict[str, float | str] | None = None
+        self._published: dict[str, float | str] | None = None
         self._announce_conditions()
         for name in ("voltage_v", "working_distance_m"):
             self.parameters.on_change(name, lambda _value: self._announce_conditions())
@@ -508,16 +508,16 @@ class VirtualSem(SemNode):
 
     def _announce_conditions(self) -> None:
         """Publish how the frames are taken if that has changed."""
-        told = conditions_of(
+        conditions = conditions_of(
             self._scene.microscope,
             voltage_v=self.parameters["voltage_v"],
             working_distance_m=self.parameters["working_distance_m"],
             scan_rotation_rad=math.radians(self.parameters["scan_rotation_deg"]),
         )
-        if told != self._told:
-            self._told = told
+        if conditions != self._published:
+            self._published = conditions
             message = DiagnosticStatus()
-            fill_conditions(message, told, self.config.name)
+            fill_conditions(message, conditions, self.config.name)
             self._conditions.publish(message)
 
     def _take_frame(self) -> None:

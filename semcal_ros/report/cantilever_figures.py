@@ -53,15 +53,6 @@ from semcal_ros.report.html.style import (
     style_axes,
 )
 
-__all__ = [
-    "draw_deflection",
-    "plot_poses",
-    "plot_strip",
-    "write_bending_video",
-    "write_poses_figure",
-    "write_strip_figure",
-]
-
 # Resolution of figures, dots per inch.
 _DPI = 90.0
 _COLORS = (OURS, SECOND, ACCENT, REFERENCE, "#8a6d00", MUTED)
@@ -73,6 +64,8 @@ _SHOWN_PX = 128
 # Quantiles of the grey levels that a video shows as black and white: one pixel in a thousand may be
 # clipped at either end.
 _BLACK_WHITE = (0.001, 0.999)
+# OpenCV draws at sixteenths of a pixel.
+_FRACTION_BITS = 4
 
 
 def write_poses_figure(agreed: Repeatability, file: Path) -> None:
@@ -166,13 +159,13 @@ def plot_poses(agreed: Repeatability) -> Figure:
     count = len(agreed.magnifications)
     for row, g in enumerate(agreed.magnifications):
         color, mark = _COLORS[row % len(_COLORS)], _MARKS[row % len(_MARKS)]
-        beside = pose + 0.12 * (row - 0.5 * (count - 1))
+        position = pose + 0.12 * (row - 0.5 * (count - 1))
         for axes, values in (
             (upper, agreed.deflection_m[row]),
             (lower, agreed.deflection_m[row] - mean),
         ):
             axes.errorbar(
-                beside,
+                position,
                 1e9 * values,
                 yerr=1.96e9 * agreed.sigma_m[row],
                 fmt=mark,
@@ -211,8 +204,8 @@ def plot_strip(
     firsts
         First frame of each pose.
     """
-    bent = [abs(series[0].frames[k].deflection_m) for k in firsts]
-    most = int(np.nanargmax(bent)) if np.isfinite(bent).any() else 0
+    deflections_m = [abs(series[0].frames[k].deflection_m) for k in firsts]
+    most = int(np.nanargmax(deflections_m)) if np.isfinite(deflections_m).any() else 0
     poses = sorted({0, most, len(firsts) - 1})[:_SHOWN_POSES]
     figure = create_figure(2.1 * len(poses), 2.2 * len(series))
     grid = figure.subplots(len(series), len(poses), squeeze=False)
@@ -275,10 +268,6 @@ def _draw_frame(axes: Axes, image: NDArray[Any], one: Series, frame: int, pose: 
     nm, sigma = 1e9 * found.deflection_m, 1e9 * found.sigma_m
     title = f"{one.magnification:g}×, pose {pose + 1}: {nm:.1f} ± {sigma:.1f} nm"
     axes.set_title(title, fontsize=7, color=INK)
-
-
-# OpenCV draws at sixteenths of a pixel.
-_FRACTION_BITS = 4
 
 
 def draw_deflection(

@@ -39,8 +39,6 @@ from semcal_ros.report.html.style import (
 )
 from semcal_ros.report.html.text import format_length
 
-__all__ = ["plot_difference", "write_difference_figure"]
-
 _DPI = 150.0
 # Letters of a line of the title: a line of them is nine of the ten inches of the figure wide.
 _LINE_LENGTH = 100

@@ -46,9 +46,6 @@ from semcal_ros.report.html.style import (
     style_axes,
 )
 
-__all__ = ["plot_drift", "write_drift_figure"]
-
-
 # Resolution: 1600 px across the figure of 10 inches.
 _DPI = 160.0
 # Half the width of an interval that holds 95 % of a normal distribution.

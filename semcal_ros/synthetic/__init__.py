@@ -20,16 +20,20 @@ arguments.
 
 from __future__ import annotations
 
-from semcal_ros.synthetic.conditions import (
-    SIMULATED_VOLTAGE_V,
-    SIMULATED_WORKING_DISTANCE_M,
-    conditions_of,
-)
 from semcal_ros.synthetic.detector import NOISE_FREE, Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
-from semcal_ros.synthetic.laws import Constant, Exponential, Logistic, Saturation
 from semcal_ros.synthetic.live import LiveFrame, LiveScene, VirtualStage
-from semcal_ros.synthetic.microscope import Residual, VirtualMicroscope
+from semcal_ros.synthetic.microscope import (
+    SIMULATED_VOLTAGE_V,
+    SIMULATED_WORKING_DISTANCE_M,
+    Constant,
+    Exponential,
+    Logistic,
+    Residual,
+    Saturation,
+    VirtualMicroscope,
+    conditions_of,
+)
 from semcal_ros.synthetic.plans import (
     CALIBRATION_MAGNIFICATIONS,
     SPECIMEN_KINDS,

@@ -24,8 +24,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["ActuatorFaults", "StageActuator"]
-
 
 @dataclass(frozen=True)
 class ActuatorFaults:

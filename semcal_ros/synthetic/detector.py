@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["NOISE_FREE", "Detector"]
-
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 # A tenth of a per cent of a field of 4096 px: lines that jump further make no image.

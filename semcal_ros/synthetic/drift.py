@@ -29,9 +29,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 
-__all__ = ["DRIFTS", "NO_DRIFT", "Drift", "DriftFunction", "drift_preset"]
-
-
 DriftFunction = Callable[[Array], Array]
 """Displacement (n, 2) in m, sem frame, at times (n,) in s: what lay at X is seen at X + drift."""
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Views of a chess grid with known truth, without images."""
+"""Views of a checkerboard with known truth, without images."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
-
-__all__ = ["grid_view", "grid_views"]
 
 
 def grid_view(
@@ -86,7 +84,7 @@ def grid_views(
             tilt = 0.0 if k == 0 else rng.uniform(np.radians(15), np.radians(40))
             axis = rng.uniform(0, 2 * np.pi)
             turn = rotations_from_vectors(np.array([[0.0, 0.0, rng.uniform(-0.6, 0.6)]]))[0]
-            lean = rotations_from_vectors(tilt * np.array([[np.cos(axis), np.sin(axis), 0.0]]))[0]
+            tilted = rotations_from_vectors(tilt * np.array([[np.cos(axis), np.sin(axis), 0.0]]))[0]
             centre = rng.uniform(-0.5, 0.5, size=2) * square_px / camera.m
             # Without its own height sigma, the first view draws no number, so that seeds keep their poses.
             sigma = flat_height_sigma_m if k == 0 else height_sigma_m
@@ -94,7 +92,7 @@ def grid_views(
             out.append(
                 grid_view(
                     camera,
-                    lean @ turn,
+                    tilted @ turn,
                     translation,
                     square_px=square_px,
                     noise_px=noise_px,

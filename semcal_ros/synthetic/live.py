@@ -34,11 +34,8 @@ from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.grid import GridFaults, Specimen
 from semcal_ros.synthetic.stage import SimulatedStage, visit_scales
 
-__all__ = ["LiveFrame", "LiveScene", "VirtualStage"]
-
-
 # Changes of magnification that are remembered, for frames that have begun before them.
-_TURNS = 16
+_KEPT_SETTINGS = 16
 # Commands of the stage that are remembered, for the same reason.
 _COMMANDS_KEPT = 32
 
@@ -153,7 +150,7 @@ class LiveFrame:
     drift_m
         (2,) drift at the centre of the acquisition, without the travel of the stage.
     square_m
-        Square size when the specimen is the chess grid, else None.
+        Square size when the specimen is the checkerboard, else None.
     visit_scale
         Factor with which this magnification came back.
     """
@@ -168,7 +165,7 @@ class LiveFrame:
     visit_scale: float = 1.0
 
 
-class _Turn(NamedTuple):
+class _Setting(NamedTuple):
     """A change of the magnification, and the factor with which it came back."""
 
     time_s: float
@@ -226,14 +223,14 @@ class LiveScene:
         self._taken = 0
         self._poses = [(-math.inf, Pose.flat() if pose is None else pose)]
         self._scales = visit_scales(faults, seed)
-        self._turns: list[_Turn] = []
+        self._settings: list[_Setting] = []
         self.set_magnification(magnification)
         self._specimen(magnification)
 
     @property
     def magnification(self) -> float:
         """Magnification that was set last."""
-        return self._turns[-1].magnification
+        return self._settings[-1].magnification
 
     @property
     def pose(self) -> Pose:
@@ -261,15 +258,17 @@ class LiveScene:
         """
         self.microscope.camera_at(magnification)
         g = float(magnification)
-        if self._turns and not self._turns[-1].time_s <= time_s:
+        if self._settings and not self._settings[-1].time_s <= time_s:
             raise InvalidValueError(
                 f"a magnification set at {time_s} s",
-                expected=f"not before the last one at {self._turns[-1].time_s} s",
+                expected=f"not before the last one at {self._settings[-1].time_s} s",
             )
-        if self._turns and self._turns[-1].magnification == g:
+        if self._settings and self._settings[-1].magnification == g:
             return
-        self._turns = [turn for turn in self._turns if turn.time_s < time_s][-_TURNS:]
-        self._turns.append(_Turn(time_s, g, next(self._scales)))
+        self._settings = [setting for setting in self._settings if setting.time_s < time_s][
+            -_KEPT_SETTINGS:
+        ]
+        self._settings.append(_Setting(time_s, g, next(self._scales)))
 
     def set_detector(self, **changes: object) -> None:
         """Change image settings by name, for instance ``bits=16``."""
@@ -334,38 +333,40 @@ class LiveScene:
             parts[-1][0].scale,
         )
 
-    def _parts(self, start_time_s: float) -> list[tuple[_Turn, Array]]:
+    def _parts(self, start_time_s: float) -> list[tuple[_Setting, Array]]:
         """Return the magnifications during a frame, each with the fraction (h, w) of every pixel's passes
         scanned at it.
         """
         timing = self.microscope.timing
         height, width = self.microscope.height, self.microscope.width
         end_s = start_time_s + timing.acquisition_time_s
-        before = sum(turn.time_s <= start_time_s for turn in self._turns)
-        turns = [turn for turn in self._turns[max(before - 1, 0) :] if turn.time_s < end_s]
-        if len(turns) < 2:
-            return [((turns or self._turns)[0], np.ones((height, width)))]
+        before = sum(setting.time_s <= start_time_s for setting in self._settings)
+        settings = [
+            setting for setting in self._settings[max(before - 1, 0) :] if setting.time_s < end_s
+        ]
+        if len(settings) < 2:
+            return [((settings or self._settings)[0], np.ones((height, width)))]
         row, col = np.mgrid[:height, :width]
         pass_s = replace(timing, averages=1).pixel_offset_s(row, col, height, width)
         times_s = start_time_s + pass_s + timing.frame_time_s * _column(timing.averages)
         # The fraction scanned since each change, minus the fraction scanned since the next one.
-        begun = [np.mean(times_s >= turn.time_s, axis=0) for turn in turns[1:]]
+        begun = [np.mean(times_s >= setting.time_s, axis=0) for setting in settings[1:]]
         shares = [np.ones((height, width)), *begun]
         left = [share - after for share, after in zip(shares, [*begun, 0.0], strict=True)]
-        return list(zip(turns, left, strict=True))
+        return list(zip(settings, left, strict=True))
 
     def _specimen(self, magnification: float) -> tuple[Specimen, float | None]:
         pixel_m = self.microscope.nominal_pixel_size_m(magnification)
         return specimen_for(self.kind, pixel_m, self.microscope.width, self.seed, self._grid)
 
     def _image(
-        self, turn: _Turn, start_time_s: float, pose: Pose, drift: DriftFunction
+        self, setting: _Setting, start_time_s: float, pose: Pose, drift: DriftFunction
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         return render_frame(
-            self.microscope.during_visit(turn.scale),
-            self._specimen(turn.magnification)[0],
+            self.microscope.during_visit(setting.scale),
+            self._specimen(setting.magnification)[0],
             pose,
-            turn.magnification,
+            setting.magnification,
             start_time_s=start_time_s,
             drift=drift,
             seed=(self.seed, self._taken),

@@ -12,12 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The virtual microscope: a camera for every magnification, with its scan timing."""
+"""The virtual microscope: a camera for every magnification, with its scan timing and its operating conditions.
+
+Its parameters change with the magnification by laws. None of them is a polynomial in g or in log g: a calibration that
+fits such polynomials meets a curve that it can only approximate, as with a real microscope, so that a test against it
+is meaningful.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,10 +32,6 @@ from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.synthetic.laws import Constant, Law
-
-__all__ = ["Residual", "VirtualMicroscope"]
-
 
 # A fixed-point step multiplies the error by the residual's derivative: from 10 px, 60 steps reach
 # the tolerance for derivatives up to 0.65.
@@ -37,6 +39,8 @@ _FIXED_POINT_STEPS = 60
 # A hundred times below the 1e-8 px of the splines that render with it, and above the rounding of a
 # coordinate of 4096 px (9e-13).
 _FIXED_POINT_TOLERANCE_PX = 1e-10
+#: Ordinary values, which are told only: no image depends on them.
+SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M = 10e3, 10e-3
 
 
 @dataclass(frozen=True)
@@ -244,3 +248,99 @@ class VirtualMicroscope:
 
 def _check_magnification(magnification: float) -> float:
     return check_positive(magnification, "magnification")
+
+
+def conditions_of(
+    microscope: VirtualMicroscope,
+    *,
+    voltage_v: float = SIMULATED_VOLTAGE_V,
+    working_distance_m: float = SIMULATED_WORKING_DISTANCE_M,
+    scan_rotation_rad: float = 0.0,
+) -> dict[str, float | str]:
+    """Return the conditions as the topic ``conditions`` names them, in SI units.
+
+    Parameters
+    ----------
+    microscope
+        With its image size and timing.
+    voltage_v, working_distance_m, scan_rotation_rad
+        What it is set to.
+    """
+    timing = microscope.timing
+    line_share = (1.0 - timing.flyback_fraction) / timing.line_averages
+    return {
+        "accelerating_voltage_v": voltage_v,
+        "working_distance_m": working_distance_m,
+        "scan_rotation_rad": scan_rotation_rad,
+        "frame_time_s": timing.frame_time_s,
+        "dwell_s": timing.frame_time_s * line_share / (microscope.width * microscope.height),
+        "detector": "simulated",
+        "maker": "semcal_ros",
+        "model": microscope.name,
+    }
+
+
+class Law(Protocol):
+    """A parameter as a function of g; hashable, because the rendered geometry is cached."""
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        ...
+
+    def __hash__(self) -> int:
+        """Equal laws have equal hashes."""
+        ...
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same value at every magnification."""
+
+    value: float
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        return self.value
+
+
+@dataclass(frozen=True)
+class Exponential:
+    """``high + (low - high) exp(-g / scale)``: ``low`` at g = 0, ``high`` far above ``scale``."""
+
+    low: float
+    high: float
+    scale: float
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        return self.high + (self.low - self.high) * math.exp(-magnification / self.scale)
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """``low + (high - low) g^n / (g^n + half^n)``: half way between the ends at ``g = half``."""
+
+    low: float
+    high: float
+    half: float
+    exponent: float = 1.0
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        fraction = 1.0 / (1.0 + (self.half / magnification) ** self.exponent)
+        return float(self.low + (self.high - self.low) * fraction)
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """``low + (high - low) / (1 + exp(-(g - middle) / width))``."""
+
+    low: float
+    high: float
+    middle: float
+    width: float
+
+    def __call__(self, magnification: float) -> float:
+        """Value at a magnification."""
+        fraction = 0.5 * (1.0 + math.tanh(0.5 * (magnification - self.middle) / self.width))
+        return float(self.low + (self.high - self.low) * fraction)

@@ -49,20 +49,6 @@ from semcal_ros.synthetic.stage import (
     visit_scales,
 )
 
-__all__ = [
-    "CALIBRATION_MAGNIFICATIONS",
-    "SPECIMEN_KINDS",
-    "PlannedFrame",
-    "RecordingPlan",
-    "calibration_plan",
-    "drift_plan",
-    "ladder_plan",
-    "specimen_for",
-    "steps_plan",
-    "zoom_plan",
-]
-
-
 SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target", "rough_target")
 
 CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in range(1, 21)))
@@ -262,7 +248,7 @@ def calibration_plan(
                 if index > 0 or len(poses) == 1:
                     tilt = stage.tilted_rad[tilted % len(stage.tilted_rad)]
                     tilted += 1
-                own, position = pose_on_stage(
+                placed, position = pose_on_stage(
                     stage,
                     tilt,
                     float(rng.uniform(-math.pi, math.pi)),
@@ -271,7 +257,7 @@ def calibration_plan(
                 )
                 frame = replace(
                     frame,
-                    pose=own,
+                    pose=placed,
                     position=position,
                     position_read=read_position(stage, position, rng),
                 )

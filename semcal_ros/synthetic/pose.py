@@ -26,8 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Pose", "random_poses", "rotation_about_beam"]
-
 
 @dataclass(frozen=True, eq=False)
 class Pose:

@@ -22,10 +22,14 @@ from types import MappingProxyType
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
-from semcal_ros.synthetic.laws import Constant, Exponential, Logistic, Saturation
-from semcal_ros.synthetic.microscope import Residual, VirtualMicroscope
-
-__all__ = ["PRESETS", "preset"]
+from semcal_ros.synthetic.microscope import (
+    Constant,
+    Exponential,
+    Logistic,
+    Residual,
+    Saturation,
+    VirtualMicroscope,
+)
 
 
 def _jsm820() -> VirtualMicroscope:

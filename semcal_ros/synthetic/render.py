@@ -30,9 +30,6 @@ from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.specimens.grid import Specimen, UnevenSpecimen
 from semcal_ros.synthetic.specimens.ray_lattice import PlaneLattice, trace_ray_lattice
 
-__all__ = ["render_frame", "render_reflectivity"]
-
-
 # Pixel rows that are drawn at once, so that a block's arrays stay in the CPU's cache: 1 MiB for
 # each coordinate at 4096 columns without supersampling.
 _BLOCK_ROWS = 32
@@ -41,7 +38,7 @@ _BLOCK_ROWS = 32
 _PASS_SPACING_PX = 0.2
 # Samples of the drift per pass when the length of its path is measured: only a vibration at a
 # multiple of seven times the pass rate escapes them.
-_LOOKS_PER_PASS = 7
+_SAMPLES_PER_PASS = 7
 _DEFAULT_DETECTOR = Detector()
 
 
@@ -162,8 +159,8 @@ def _pass_groups(
     timing: ScanTiming = microscope.timing
     passes = np.arange(timing.averages)
     # Several samples per pass: a vibration in step with the passes must not go unnoticed.
-    looks = np.linspace(0.0, timing.averages, _LOOKS_PER_PASS * timing.averages + 1)
-    path_m = np.diff(np.asarray(drift(start_time_s + looks * timing.frame_time_s)), axis=0)
+    samples = np.linspace(0.0, timing.averages, _SAMPLES_PER_PASS * timing.averages + 1)
+    path_m = np.diff(np.asarray(drift(start_time_s + samples * timing.frame_time_s)), axis=0)
     m = microscope.camera_at(magnification).m
     path_px = m * float(np.hypot(path_m[:, 0], path_m[:, 1]).sum())
     count = min(timing.averages, 1 + math.floor(path_px / _PASS_SPACING_PX))

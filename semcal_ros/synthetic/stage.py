@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 # Beyond these it is no stage of a microscope, or the unit is wrong.
-_LARGEST_MISS_M = 5e-3
+_LARGEST_OFFSET_M = 5e-3
 _LARGEST_SCALE_SIGMA = 0.05
 _STEEPEST_RAD = math.radians(70.0)
 
@@ -96,11 +96,11 @@ class SimulatedStage:
     rotation_sigma_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(abs(miss) <= _LARGEST_MISS_M for miss in self.miss_m):
-            listed = " and ".join(f"{1e6 * miss:g}" for miss in self.miss_m)
+        if not all(abs(offset) <= _LARGEST_OFFSET_M for offset in self.miss_m):
+            listed = " and ".join(f"{1e6 * offset:g}" for offset in self.miss_m)
             raise InvalidValueError(
                 f"a tilt axis that misses the specimen by {listed} um",
-                expected=f"at most {1e6 * _LARGEST_MISS_M:g} um",
+                expected=f"at most {1e6 * _LARGEST_OFFSET_M:g} um",
             )
         if not 0.0 <= self.scale_sigma <= _LARGEST_SCALE_SIGMA:
             raise InvalidValueError(
@@ -371,9 +371,9 @@ def pose_on_stage(
     direction = stage.axis_rad if direction_rad is None else direction_rad
     if direction is None:
         raise InvalidValueError("a stage without a tilt axis", expected="the direction of the tilt")
-    pivot, lean = _pivot_and_lean(stage, tilt_rad, direction)
-    beside = np.asarray(offset_m, dtype=np.float64) - (pivot - lean @ pivot)[:2]
-    x, y = np.linalg.solve(lean[:2, :2], beside)
+    pivot, tilt = _pivot_and_tilt(stage, tilt_rad, direction)
+    offset = np.asarray(offset_m, dtype=np.float64) - (pivot - tilt @ pivot)[:2]
+    x, y = np.linalg.solve(tilt[:2, :2], offset)
     position = StagePosition(tilt_rad, rotation_rad, float(x), float(y))
     return pose_at(stage, position, direction, height_m=height_m), position
 
@@ -398,14 +398,14 @@ def pose_at(
     height_m
         Height of the specimen without a tilt.
     """
-    pivot, lean = _pivot_and_lean(stage, position.tilt_rad, direction_rad)
+    pivot, tilt = _pivot_and_tilt(stage, position.tilt_rad, direction_rad)
     # The stage carries the specimen to s on the tilted plane: X = lean (s - pivot) + pivot.
     travel = np.array([position.x_m, position.y_m, 0.0])
-    origin = lean @ (travel - pivot) + pivot + np.array([0.0, 0.0, height_m])
-    return Pose(lean @ _turn([0.0, 0.0, 1.0], position.rotation_rad), origin)
+    origin = tilt @ (travel - pivot) + pivot + np.array([0.0, 0.0, height_m])
+    return Pose(tilt @ _turn([0.0, 0.0, 1.0], position.rotation_rad), origin)
 
 
-def _pivot_and_lean(
+def _pivot_and_tilt(
     stage: SimulatedStage, tilt_rad: float, direction_rad: float
 ) -> tuple[Array, Array]:
     along = np.array([np.cos(direction_rad), np.sin(direction_rad), 0.0])

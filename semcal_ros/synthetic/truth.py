@@ -53,8 +53,6 @@ from typing import Any
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.plans import RecordingPlan
 
-__all__ = ["TRUTH_SCHEMA", "parameters_of", "truth_of"]
-
 TRUTH_SCHEMA = "semcal_ros/truth/1"
 
 

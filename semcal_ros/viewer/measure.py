@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Lengths between two places in a picture, with the uncertainty that the calibration leaves."""
+"""Lengths between two places in a picture, with the uncertainty that the calibration leaves, and as texts."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PICTURES", "Distance", "measure_distance"]
-
 PICTURES = ("raw", "corrected")
 """The pictures in which can be measured."""
+_UNITS = ((1e-6, "µm"), (1e-9, "nm"))
 
 
 @dataclass(frozen=True)
@@ -130,3 +129,24 @@ def _calibration_sigma_m(camera: ScanCamera, points: Array, way: Array) -> float
     gradient = (way / length) @ (moved[1] - moved[0])
     variance = float(gradient @ covariance @ gradient)
     return math.sqrt(variance) if math.isfinite(variance) and variance >= 0.0 else None
+
+
+def digits_of(sigma: float) -> int:
+    """Return how many decimals show two digits of a 1-sigma: 0 to 6, and 3 where it is not known."""
+    if not (math.isfinite(sigma) and sigma > 0.0):
+        return 3
+    return min(max(1 - math.floor(math.log10(sigma)), 0), 6)
+
+
+def format_with_sigma(length_m: float, sigma_m: float | None) -> str:
+    """Format a length and its 1-sigma in one unit, µm or nm, with two digits of the 1-sigma.
+
+    Without one, the text says that the scale is nominal; with one that is not finite, that it is not known.
+    """
+    size, unit = next((u for u in _UNITS if abs(length_m) >= 0.9995 * u[0]), _UNITS[-1])
+    if sigma_m is None:
+        return f"{length_m / size:.4g} {unit} (nominal)"
+    if not math.isfinite(sigma_m):
+        return f"{length_m / size:.4g} {unit} (uncertainty not known)"
+    digits = digits_of(sigma_m / size)
+    return f"{length_m / size:.{digits}f} ± {sigma_m / size:.{digits}f} {unit}"

@@ -25,8 +25,13 @@ from typing import Any
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.images.scale_bar import choose_scale_bar, format_length
 from semcal_ros.files.images.write import pixel_scale
-from semcal_ros.viewer.lengths import digits_of, format_with_sigma
-from semcal_ros.viewer.measure import PICTURES, Distance, measure_distance
+from semcal_ros.viewer.measure import (
+    PICTURES,
+    Distance,
+    digits_of,
+    format_with_sigma,
+    measure_distance,
+)
 from semcal_ros.viewer.pictures import (
     Contrast,
     Levels,
@@ -37,22 +42,12 @@ from semcal_ros.viewer.pictures import (
 )
 from semcal_ros.viewer.source import View
 
-__all__ = [
-    "Wish",
-    "describe_distance",
-    "encode_overlay",
-    "encode_view",
-    "measure",
-    "read_value",
-    "read_wish",
-]
-
 # A page that asks for more gets this: the longest side of a screen with room to spare.
 _LARGEST_WIDTH_PX = 4096
 
 
 @dataclass(frozen=True)
-class Wish:
+class PageRequest:
     """What a page wants to see.
 
     Attributes
@@ -100,7 +95,7 @@ def _pair(value: Any, name: str) -> tuple[float, float]:
     return _number(value[0], name), _number(value[1], name)
 
 
-def read_wish(message: dict[str, Any], before: Wish) -> Wish:
+def read_page_request(message: dict[str, Any], before: PageRequest) -> PageRequest:
     """Read what a page wants; what the message leaves out stays as before.
 
     Raises
@@ -108,30 +103,30 @@ def read_wish(message: dict[str, Any], before: Wish) -> Wish:
     InvalidValueError
         A value is of another kind or out of its range.
     """
-    wish = before
+    request = before
     if "pictures" in message:
         named = message["pictures"]
         if not isinstance(named, list) or not all(name in PICTURES for name in named):
             raise InvalidValueError(f"pictures = {named!r}", expected=" or ".join(PICTURES))
-        wish = replace(wish, pictures=tuple(name for name in PICTURES if name in named))
+        request = replace(request, pictures=tuple(name for name in PICTURES if name in named))
     if "width" in message:
         width = _number(message["width"], "width")
-        wish = replace(wish, width_px=int(min(max(width, 16.0), _LARGEST_WIDTH_PX)))
+        request = replace(request, width_px=int(min(max(width, 16.0), _LARGEST_WIDTH_PX)))
     if "contrast" in message:
-        told = message["contrast"]
-        if not isinstance(told, dict):
-            raise InvalidValueError(f"contrast = {told!r}", expected="mode, low and high")
-        mode = str(told.get("mode", "auto"))
+        given = message["contrast"]
+        if not isinstance(given, dict):
+            raise InvalidValueError(f"contrast = {given!r}", expected="mode, low and high")
+        mode = str(given.get("mode", "auto"))
         contrast = Contrast(mode)
         if mode == "fixed":
-            low, high = (_number(told.get(name), name) for name in ("low", "high"))
+            low, high = (_number(given.get(name), name) for name in ("low", "high"))
             contrast = Contrast(mode, low, high)
-        wish = replace(wish, contrast=contrast)
+        request = replace(request, contrast=contrast)
     if "zoom" in message:
-        wish = replace(wish, zoom=_number(message["zoom"], "zoom"))
+        request = replace(request, zoom=_number(message["zoom"], "zoom"))
     if "centre" in message:
-        wish = replace(wish, centre=_pair(message["centre"], "centre"))
-    return wish
+        request = replace(request, centre=_pair(message["centre"], "centre"))
+    return request
 
 
 def _pack(header: dict[str, object], blobs: list[bytes]) -> bytes:
@@ -154,14 +149,14 @@ def _scale(view: View, width_px: int) -> dict[str, object] | None:
     }
 
 
-def encode_view(view: View, wish: Wish, *, age_s: float | None = None) -> bytes:
+def encode_view(view: View, request: PageRequest, *, age_s: float | None = None) -> bytes:
     """Encode a frame as one message: a header in JSON, and its pictures as JPEG.
 
     All pictures are stretched by the levels of the first one, so that they can be compared.
 
     Parameters
     ----------
-    view, wish
+    view, request
         What there is, and what the page wants of it.
     age_s
         Time since the stamp, where both are of one clock.
@@ -173,12 +168,12 @@ def encode_view(view: View, wish: Wish, *, age_s: float | None = None) -> bytes:
         if (image := view.pictures.get(name)) is None:
             continue
         if levels is None:
-            levels = choose_levels(image, wish.contrast)
-        if name not in wish.pictures:
+            levels = choose_levels(image, request.contrast)
+        if name not in request.pictures:
             continue
         height, width = image.shape[:2]
-        region = choose_region((width, height), wish.zoom, wish.centre)
-        data, shown = encode_picture(image, levels, region, wish.width_px)
+        region = choose_region((width, height), request.zoom, request.centre)
+        data, shown = encode_picture(image, levels, region, request.width_px)
         blobs.append(data)
         pictures.append(
             {

@@ -27,17 +27,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "Contrast",
-    "Levels",
-    "Outlines",
-    "Region",
-    "choose_levels",
-    "choose_region",
-    "encode_picture",
-    "outline",
-]
-
 #: Closed polygons of (x, y) px.
 Outlines = tuple[tuple[tuple[int, int], ...], ...]
 

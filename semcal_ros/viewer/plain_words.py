@@ -24,8 +24,6 @@ from semcal_ros.bridge.diagnostics import split_states
 from semcal_ros.core.wording import counted
 from semcal_ros.viewer.source import Note, Rate
 
-__all__ = ["NodeReport", "describe_rates", "explain"]
-
 _OK, _WARN, _ERROR = "ok", "warn", "error"
 # Levels of diagnostic_msgs/DiagnosticStatus.
 _LEVELS = {0: _OK, 1: _WARN, 2: _ERROR, 3: _ERROR}

@@ -34,13 +34,11 @@ from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame, Recording
-from semcal_ros.viewer.lengths import format_with_sigma
+from semcal_ros.viewer.measure import format_with_sigma
 from semcal_ros.viewer.pictures import Outlines, outline
 from semcal_ros.viewer.source import DriftPanel, Note, Rate, Status, Timeline, View
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 from semcal_ros.workflows.follow_drift import DriftFollower, camera_for, start_time_s
-
-__all__ = ["RecordingSource"]
 
 # A frame that is further ahead is looked up; the frames up to it are read, as a video is.
 _SKIPPED = 16

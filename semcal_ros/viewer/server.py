@@ -39,16 +39,14 @@ from tornado import httpserver, web, websocket
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.images.write import PixelScale, pixel_scale, write_image
 from semcal_ros.viewer.messages import (
-    Wish,
+    PageRequest,
     encode_overlay,
     encode_view,
     measure,
+    read_page_request,
     read_value,
-    read_wish,
 )
 from semcal_ros.viewer.source import ACTIONS, View, ViewSource
-
-__all__ = ["LOCAL_HOSTS", "PageServer"]
 
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names of this computer by which only its own users come in; no token is asked of them."""
@@ -336,7 +334,7 @@ class _Live(websocket.WebSocketHandler):
 
     def initialize(self, server: PageServer) -> None:
         self._server = server
-        self._wish = Wish()
+        self._request = PageRequest()
         self._changed = True
         self._sent = self._overlay = -1
         self._waits_since_s: float | None = None
@@ -399,7 +397,7 @@ class _Live(websocket.WebSocketHandler):
         if age_s is not None and abs(age_s) > _OTHER_CLOCK_S:
             age_s = None
         started_s = time.monotonic()
-        data = await self._in_background(encode_view, view, self._wish, age_s=age_s)
+        data = await self._in_background(encode_view, view, self._request, age_s=age_s)
         self._server.note_encoding(time.monotonic() - started_s)
         self._waits_since_s = time.monotonic()
         await self.write_message(data, binary=True)
@@ -416,10 +414,10 @@ class _Live(websocket.WebSocketHandler):
     def on_message(self, message: str | bytes) -> None:
         """Extend the base class: what the page asks is answered, never raised."""
         try:
-            told = json.loads(message)
-            if not isinstance(told, dict):
+            request = json.loads(message)
+            if not isinstance(request, dict):
                 raise InvalidValueError("a message that is no object", expected="a JSON object")
-            self._answer(told)
+            self._answer(request)
         except (SemcalError, ValueError, RecursionError) as error:
             self._tell({"type": "refused", "text": " ".join(str(error).split())})
 
@@ -428,23 +426,27 @@ class _Live(websocket.WebSocketHandler):
         if self.ws_connection is not None and not self.ws_connection.is_closing():
             self.write_message(json.dumps(answer))
 
-    def _answer(self, told: dict[str, Any]) -> None:
-        kind = told.get("type")
+    def _answer(self, request: dict[str, Any]) -> None:
+        kind = request.get("type")
         if kind == "seen":
             self._waits_since_s = None
-        elif kind == "wish":
-            self._wish = read_wish(told, self._wish)
+        elif kind == "request":
+            self._request = read_page_request(request, self._request)
             self._changed = True
         elif kind == "measure":
             view = self._server.source.newest()
-            self._tell({"type": "measured", "of": str(told.get("of", "")), **measure(view, told)})
-        elif kind == "act" and told.get("action") in ACTIONS:
-            task = asyncio.create_task(self._act(told["action"], read_value(told.get("value"))))
+            self._tell(
+                {"type": "measured", "of": str(request.get("of", "")), **measure(view, request)}
+            )
+        elif kind == "act" and request.get("action") in ACTIONS:
+            task = asyncio.create_task(
+                self._act(request["action"], read_value(request.get("value")))
+            )
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
         else:
             raise InvalidValueError(
-                f"a message of type {kind!r}", expected="seen, wish, measure or act"
+                f"a message of type {kind!r}", expected="seen, request, measure or act"
             )
 
     async def _act(self, action: str, value: float | tuple[float, ...] | None) -> None:

@@ -24,21 +24,6 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.viewer.pictures import Outlines
 
-__all__ = [
-    "ACTIONS",
-    "AcquisitionPanel",
-    "Bar",
-    "CalibrationPanel",
-    "DriftPanel",
-    "Magnification",
-    "Note",
-    "Rate",
-    "Status",
-    "Timeline",
-    "View",
-    "ViewSource",
-]
-
 ACTIONS = (
     *("start", "stop", "reset"),
     *("add_view", "calibrate", "acquire", "cancel", "check", "save", "clear"),

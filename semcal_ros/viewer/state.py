@@ -12,27 +12,30 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the page says of magnification and drift, in words."""
+"""What the page says: magnification and drift in words, and in bars how much of a good calibration the views cover."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.viewer.lengths import format_with_sigma
-from semcal_ros.viewer.source import DriftPanel, Magnification
-
-__all__ = ["DriftTrace", "describe_magnification", "drift_in_pixels"]
+from semcal_ros.viewer.measure import format_with_sigma
+from semcal_ros.viewer.source import AcquisitionPanel, Bar, DriftPanel, Magnification
 
 # Points of the trace that the page draws: as many as it has pixels across.
 _DRAWN = 300
 # About a day at ten frames per second would be a million; a smooth way needs far fewer.
 _KEPT = 20_000
+# What doc/calibration.md asks for: five views at each magnification, tilts that differ by 20 to 40 degrees, and nine
+# magnifications.
+_VIEWS, _TILT_DEG, _MAGNIFICATIONS = 5, 30.0, 9
 
 
 def describe_magnification(
@@ -52,18 +55,20 @@ def describe_magnification(
     text = f"{magnification:.6g}×"
     if calibration is None:
         return Magnification(text, "unknown", "not calibrated")
-    told = _span(calibration.magnification_range)
+    calibrated = _span(calibration.magnification_range)
     origin = calibration.origin_of(magnification)
     if origin == "extrapolated":
-        return Magnification(text, "outside", f"outside the calibration, {told}")
+        return Magnification(text, "outside", f"outside the calibration, {calibrated}")
     if calibration.ladder is None:
-        return Magnification(text, "ok", f"calibrated, {told}")
+        return Magnification(text, "ok", f"calibrated, {calibrated}")
     if calibration.method == "specimen":
-        return Magnification(text, "ok", f"calibrated by a specimen, {told}")
+        return Magnification(text, "ok", f"calibrated by a specimen, {calibrated}")
     grid = _span(calibration.ladder.anchored)
     if origin == "grid":
-        return Magnification(text, "ok", f"calibrated by a grid, {grid}; by a specimen, {told}")
-    return Magnification(text, "ok", f"calibrated by a specimen, {told}; by a grid, {grid}")
+        return Magnification(
+            text, "ok", f"calibrated by a grid, {grid}; by a specimen, {calibrated}"
+        )
+    return Magnification(text, "ok", f"calibrated by a specimen, {calibrated}; by a grid, {grid}")
 
 
 def _span(ends: tuple[float, float]) -> str:
@@ -133,3 +138,95 @@ class DriftTrace:
         rounded = tuple((round(x, 3), round(y, 3)) for x, y in drawn)
         sigma_nm = 1e9 * sigma_m if math.isfinite(sigma_m) else 0.0
         return DriftPanel(text, rounded, points[-1], sigma_nm)
+
+
+def _number(values: Mapping[str, str], key: str) -> float | None:
+    try:
+        number = float(values[key])
+    except (KeyError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _views(values: Mapping[str, str]) -> dict[float, int]:
+    found = {}
+    for key, value in values.items():
+        if (match := re.fullmatch(r"views at (\S+)x", key)) and value.isdigit():
+            found[float(match[1])] = int(value)
+    return dict(sorted(found.items()))
+
+
+def describe_coverage(values: Mapping[str, str]) -> tuple[Bar, ...]:
+    """Describe what the views cover.
+
+    Parameters
+    ----------
+    values
+        The key-value pairs of ``calibration_server/progress``.
+    """
+    views = _views(values)
+    most, least = max(views.values(), default=0), min(views.values(), default=0)
+    each = f"{least}" if least == most else f"{least} to {most}"
+    field = _number(values, "field_share") or 0.0
+    least_deg, most_deg = _number(values, "least_tilt_deg"), _number(values, "largest_tilt_deg")
+    if least_deg is None or most_deg is None:
+        spread_deg, tilts = 0.0, f"none; spread over {_TILT_DEG:.0f}° is good"
+    else:
+        spread_deg = most_deg - least_deg
+        tilts = f"{least_deg:.0f}° to {most_deg:.0f}°; spread over {_TILT_DEG:.0f}° is good"
+    covered = "none"
+    if views:
+        low, high = min(views), max(views)
+        reach = f"at {low:g}×" if low == high else f"from {low:g}× to {high:g}×"
+        covered = f"{len(views)} {reach}"
+    return (
+        Bar("Field with corners", field, f"{field:.0%}"),
+        Bar("Tilts", min(spread_deg / _TILT_DEG, 1.0), tilts),
+        Bar(
+            "Magnifications",
+            min(len(views) / _MAGNIFICATIONS, 1.0),
+            f"{covered}; {_MAGNIFICATIONS} or more are good",
+        ),
+        Bar(
+            "Views of each",
+            min(least / _VIEWS, 1.0),
+            f"{each}; {_VIEWS} are good" if views else f"none; {_VIEWS} are good",
+        ),
+    )
+
+
+def describe_run(values: Mapping[str, str]) -> Bar | None:
+    """Describe a calibration that is running; None without one."""
+    fraction = _number(values, "fraction")
+    if fraction is None or "stage" not in values or values["stage"] == "done":
+        return None
+    return Bar("Calibrating", min(max(fraction, 0.0), 1.0), values["stage"])
+
+
+def describe_acquisition(values: Mapping[str, str]) -> AcquisitionPanel | None:
+    """Describe a calibration that records itself; None from a server that does not tell of it."""
+    microscope = values.get("microscope")
+    if microscope is None:
+        return None
+    low, high = _number(values, "lowest_magnification"), _number(values, "highest_magnification")
+    target, sigma = _number(values, "target"), _number(values, "largest_sigma")
+    taken, planned = _number(values, "taken"), _number(values, "planned")
+    bars: tuple[Bar, ...] = ()
+    if taken is not None and planned:
+        left_out = _number(values, "left_out") or 0.0
+        text = f"{taken:.0f} of {planned:.0f} so far" + f", {left_out:.0f} left out" * bool(
+            left_out
+        )
+        bars = (Bar("Views of the plan", min(taken / planned, 1.0), text),)
+    if target and bars:
+        known = "not known yet" if sigma is None else f"{100.0 * sigma:.2g} %"
+        share = 0.0 if not sigma else min(target / sigma, 1.0)
+        bars += (Bar("Certainty of nm per px", share, f"{known}; {100.0 * target:.2g} % wanted"),)
+    return AcquisitionPanel(
+        values.get("acquisition", "ready"),
+        f"{microscope} moves by itself" if microscope else "you set each view, step by step",
+        values.get("request", ""),
+        bars,
+        (low, high) if low and high else None,
+        target,
+    )

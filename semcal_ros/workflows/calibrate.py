@@ -186,14 +186,14 @@ def _check_stated_scale(collected: CollectedViews) -> None:
 
 def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[Finding]:
     """Return a finding if the calibration refused the tilts of most views that have one, else nothing."""
-    told = {v.name for v in views if v.stage is not None and v.stage.tilt_rad is not None}
-    refused = sum(v.name in told and v.stage is None for v in result.views)
-    if refused <= _MOST_REFUSED * len(told):
+    stated = {v.name for v in views if v.stage is not None and v.stage.tilt_rad is not None}
+    refused = sum(v.name in stated and v.stage is None for v in result.views)
+    if refused <= _MOST_REFUSED * len(stated):
         return []
     # The tilts that were not refused are wrong too, by less; they have pulled the scale with them.
     return [
         Finding(
-            f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: the stage is not "
+            f"scale: {refused} of {counted(len(stated), 'view')} contradict the tilt of the stage: the stage is not "
             "used; check the unit of its angles, and its stamps"
         )
     ]

@@ -208,7 +208,7 @@ def check_specimen(
             advance(1)
         notes = recording.notes
     moved = tuple(
-        own for g in sorted(moves) if (own := moves[g].judge(g, stage_accuracy)) is not None
+        check for g in sorted(moves) if (check := moves[g].judge(g, stage_accuracy)) is not None
     )
     if len(images) < 2 and moved:
         return SpecimenCheck((), notes, moved)
@@ -233,10 +233,10 @@ def check_specimen(
 
 
 def _tells_position(frame: RecordedFrame) -> bool:
-    own = frame.stage
-    if own is None or own.x_m is None or own.y_m is None:
+    stage = frame.stage
+    if stage is None or stage.x_m is None or stage.y_m is None:
         return False
-    return abs(own.tilt_rad or 0.0) < _FLAT_RAD
+    return abs(stage.tilt_rad or 0.0) < _FLAT_RAD
 
 
 @dataclass
@@ -278,8 +278,8 @@ class _Moves:
             return None
         stated = [s / pixel_m for s in camera.pixel_size_sigma_m]
         scale = tuple(
-            math.sqrt(own**2 + stage_accuracy**2 + known**2)
-            for own, known in zip((found.scale_x_sigma, found.scale_y_sigma), stated, strict=True)
+            math.sqrt(sigma**2 + stage_accuracy**2 + known**2)
+            for sigma, known in zip((found.scale_x_sigma, found.scale_y_sigma), stated, strict=True)
         )
         skew = math.sqrt(found.skew_sigma**2 + stage_accuracy**2 + _relative_sigmas(camera)[2] ** 2)
         return MovesCheck(magnification, found, (scale[0], scale[1]), skew)
@@ -303,11 +303,11 @@ def _compare(
     a, b, c, d = found.matrix.ravel()
     # Of a matrix near one: scale, stretch along x against y, and shear.
     maps = np.array([[0.5, 0.0, 0.0, 0.5], [0.5, 0.0, 0.0, -0.5], [0.0, 1.0, 1.0, 0.0]])
-    own = np.sqrt(np.diag(maps @ found.covariance @ maps.T))
+    sigmas = np.sqrt(np.diag(maps @ found.covariance @ maps.T))
     # A line lasts longer than the pixels of it: drift moves lines, which stretches and shears the image.
     drift = _DRIFT_PX * math.sqrt(2.0) / template.shape[0] * np.array([0.5, 0.5, 1.0])
     stated = [_relative_sigmas(camera) for camera in cameras]
-    sigma = np.sqrt(own**2 + drift**2 + stated[0] ** 2 + stated[1] ** 2)
+    sigma = np.sqrt(sigmas**2 + drift**2 + stated[0] ** 2 + stated[1] ** 2)
     values = (math.sqrt(a * d - b * c) - 1.0, 0.5 * (a - d), b + c)
     return ScaleRatio(
         low[0], high[0], values[0], sigma[0], values[1], sigma[1], values[2], sigma[2]

@@ -46,13 +46,13 @@ class ConditionsComparison:
 
     def add(self, frame: RecordedFrame) -> None:
         """Take the conditions of a frame."""
-        own = frame.conditions
-        if self._calibration is None or own is None or own == self._last:
+        conditions = frame.conditions
+        if self._calibration is None or conditions is None or conditions == self._last:
             return
-        self._last = own
+        self._last = conditions
         found = compare_conditions(
             self._calibration.provenance.conditions,
-            {name: value for name, value in asdict(own).items() if value not in (None, "")},
+            {name: value for name, value in asdict(conditions).items() if value not in (None, "")},
             height_sigma_m=self._calibration.scale_sigma.height_m,
         )
         self._found |= {difference.text: difference.decisive for difference in found}
@@ -73,6 +73,6 @@ class ConditionsComparison:
         return tuple(printable(note) for note in out)
 
     def _name(self, decisive: bool) -> str:
-        texts = [text for text, own in self._found.items() if own is decisive]
+        texts = [text for text, is_decisive in self._found.items() if is_decisive is decisive]
         more = len(texts) - _MOST_NAMED
         return ", ".join(texts[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -317,8 +317,8 @@ class _Seen:
 
     def summarise(self, opened: Recording, files: Iterable[Path]) -> RecordingSummary:
         first_ns, last_ns = min(self.stamps_ns), max(self.stamps_ns)
-        own = {encoding for _, encoding in self.kinds if encoding}
-        assumed = own.pop() if len(own) == 1 else ""
+        encodings = {encoding for _, encoding in self.kinds if encoding}
+        assumed = encodings.pop() if len(encodings) == 1 else ""
         kinds: Counter[str] = Counter()
         for ((width, height), encoding), count in self.kinds.items():
             kinds[f"{width} x {height} {encoding or assumed}".rstrip()] += count

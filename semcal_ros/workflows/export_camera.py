@@ -31,9 +31,10 @@ from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes, atomic_write_text
-from semcal_ros.files.foreign_cameras.imagej import compute_raw_map, format_macro
-from semcal_ros.files.foreign_cameras.pinhole_text import (
+from semcal_ros.files.foreign_cameras import (
+    compute_raw_map,
     format_colmap,
+    format_macro,
     format_mrcal,
     format_opencv,
     format_ros,

@@ -84,11 +84,13 @@ def import_calibration(
         if len(row) <= max(magnification, size):
             raise InvalidValueError(f"{where}{len(row)} values", expected=f"{len(columns)}")
         value_m = unit * _number(row[size], where)
-        own = sigma
+        relative_sigma = sigma
         if spreads and len(row) > spreads[0] and row[spreads[0]].strip():
             spread = _number(row[spreads[0]], where)
-            own = 0.01 * spread if percent else spread_unit * spread / value_m
-        known.append(KnownPixelSize(_number(row[magnification], where), value_m, own, where))
+            relative_sigma = 0.01 * spread if percent else spread_unit * spread / value_m
+        known.append(
+            KnownPixelSize(_number(row[magnification], where), value_m, relative_sigma, where)
+        )
     model = make_nominal_calibration(known, image_size, display_width_m)
     origin = replace(describe_computation(), recording=f"{path.name} (a table of pixel sizes)")
     return Calibration.from_model(replace(model, provenance=origin))

@@ -123,7 +123,7 @@ def list_recording_files(source: Source) -> list[Path]:
     files: list[Path] = []
     for path in source.paths:
         if path.is_dir() and (path / "metadata.yaml").exists():
-            files += [own for own in path.rglob("*") if own.is_file()]
+            files += [file for file in path.rglob("*") if file.is_file()]
         elif path.is_file():
             files.append(path)
         else:
@@ -149,8 +149,8 @@ def sum_up(values: set[Any]) -> tuple[Any, ...]:
 def _digest(files: Sequence[Path]) -> str:
     """SHA-256 of the one data file, or of the lines that ``sha256sum`` prints of several by name."""
     # Other files in a bag's folder, such as metadata.yaml and notes, change without any change of the data.
-    own = [file for file in files if _BAG_DATA.intersection(file.suffixes)]
-    data = sorted(own or files, key=lambda file: file.name)
+    data_files = [file for file in files if _BAG_DATA.intersection(file.suffixes)]
+    data = sorted(data_files or files, key=lambda file: file.name)
     digests = []
     for file in data:
         found = hashlib.sha256()

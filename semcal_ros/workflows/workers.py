@@ -245,7 +245,7 @@ def _check_workers(client: Any, dask: str) -> int:
 
 
 def describe_versions() -> dict[str, str]:
-    """Versions of what computes."""
+    """Versions of this package and of the libraries that compute, which all workers must share."""
     return {
         "semcal_ros": semcal_ros.__version__,
         "numpy": np.__version__,

@@ -39,7 +39,7 @@ from semcal_ros.config.config import (
     load_config,
     parse_config,
 )
-from semcal_ros.config.yaml_text import load_yaml
+from semcal_ros.config.files import load_yaml
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 

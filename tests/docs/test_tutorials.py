@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import subprocess
@@ -26,7 +25,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.listings import differences, listings, run_page
-from tests.helpers.project import NODES, ROOT
+from tests.helpers.project import NODES, ROOT, load_script
 
 DOC = ROOT / "doc"
 TUTORIALS = sorted((DOC / "tutorials").glob("*.md"))
@@ -167,10 +166,7 @@ def test_the_site_builds_without_a_warning() -> None:
 @pytest.mark.long
 def test_a_link_that_leads_nowhere_fails_the_build(tmp_path: Path, link: str, good: bool) -> None:
     """By the settings of mkdocs.yml, on one page."""
-    spec = importlib.util.spec_from_file_location("build_docs", ROOT / "scripts" / "build_docs.py")
-    assert spec is not None and spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    script = load_script("build_docs")
     if not script.install():
         pytest.skip("MkDocs cannot be installed here")
     (tmp_path / "pages").mkdir()

@@ -84,7 +84,7 @@ def test_what_is_no_video(name: str, tmp_path: Path) -> None:
 def test_a_side_file_says_the_magnification(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("semcal_ros.drivers.video._LOOK_S", 0.0)
+    monkeypatch.setattr("semcal_ros.drivers.video._EXAMINE_S", 0.0)
     path = tmp_path / "mag.txt"
     side = SideFile(path, 0.12)
     assert side.field_width_m() is None

@@ -31,7 +31,7 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.bags.reader import open_bag
-from semcal_ros.files.images.plain import read_plain_image
+from semcal_ros.files.images.image_file import read_plain_image
 from semcal_ros.files.images.to_bag import METADATA_TOPIC, import_images
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tiff.read import (

@@ -16,14 +16,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.helpers.listings import differences
-from tests.helpers.project import ROOT
+from tests.helpers.project import load_script
 
 
 def follow_notebook(path: Path, folder: Path, tolerance: float, but: str = "") -> int:
@@ -36,11 +35,7 @@ def follow_notebook(path: Path, folder: Path, tolerance: float, but: str = "") -
     """
     # `colcon test` has no IPython.
     pytest.importorskip("IPython")
-    script = ROOT / "scripts" / "run_notebooks.py"
-    spec = importlib.util.spec_from_file_location("run_notebooks", script)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_script("run_notebooks")
     kept = module.read_notebook(path)
     done = module.run_notebook(path, folder, but)
     compared = 0

@@ -26,13 +26,14 @@ from pathlib import Path
 import pytest
 
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.middleware.fastdds_profile import (
+from semcal_ros.middleware.transport_advice import (
     DEFAULT_SEGMENT_BYTES,
+    MALLOC_VARIABLES,
     PROFILE_VARIABLES,
     profile_file,
     shared_memory,
+    transport_advice,
 )
-from semcal_ros.middleware.transport_advice import MALLOC_VARIABLES, transport_advice
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "dds" / "fastdds_large_images.xml"

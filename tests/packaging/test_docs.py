@@ -100,6 +100,30 @@ def test_named_files_and_modules_exist() -> None:
     assert missing == []
 
 
+def test_docstrings_cite_pages_and_headings_that_exist() -> None:
+    """As ``doc/page.md``, or ``doc/page.md``, "Heading"."""
+    missing = []
+    for path in (ROOT / "semcal_ros").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        for page, heading in re.findall(r'``(doc/[\w./]+)``(?:, "([^"\n]+)")?', text):
+            cited = ROOT / page
+            lines = cited.read_text(encoding="utf-8").splitlines() if cited.exists() else [""]
+            titles = {line.lstrip("#").strip() for line in lines if line.startswith("#")}
+            if not titles or (heading and heading not in titles):
+                missing.append(f"{path.name}: {page} {heading}")
+    assert missing == []
+
+
+def test_the_page_of_flows_names_modules_that_exist() -> None:
+    """With or without their folders, as `live_drift.py` or `nodes/frames/live_drift.py`."""
+    text = (ROOT / "doc" / "how_it_runs.md").read_text(encoding="utf-8")
+    paths = [p.as_posix() for p in (ROOT / "semcal_ros").rglob("*.py")]
+    paths += [p.as_posix() for p in (ROOT / "tests").rglob("*.py")]
+    named = set(re.findall(r"[\w/]+\.py\b", text))
+    assert len(named) > 50
+    assert {name for name in named if not any(p.endswith(f"/{name}") for p in paths)} == set()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_named_commands_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")

@@ -30,12 +30,11 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.files.images.write import PixelScale
 from semcal_ros.report import write_calibration_report
-from semcal_ros.report.ball_figures import plot_ball
 from semcal_ros.report.cantilever_figures import plot_poses, plot_strip
 from semcal_ros.report.comparison_figure import plot_difference
 from semcal_ros.report.html import encode
 from semcal_ros.report.html.style import create_figure, set_magnification_axis, style_axes
-from semcal_ros.report.relief_figures import plot_relief
+from semcal_ros.report.reconstruction_figures import plot_ball, plot_relief
 from tests.helpers.figure_layout import faults
 from tests.helpers.report_samples import DISPLAY_M, SIZE, grid_view
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import pytest
 
-from semcal_ros.viewer.coverage import describe_acquisition, describe_coverage, describe_run
+from semcal_ros.viewer.state import describe_acquisition, describe_coverage, describe_run
 
 
 def test_bars_fill_with_the_views() -> None:

@@ -30,7 +30,7 @@ import semcal_ros
 from semcal_ros.bridge.diagnostics import join_states
 from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.viewer.lengths import format_with_sigma
+from semcal_ros.viewer.measure import format_with_sigma
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain
 from semcal_ros.viewer.state import DriftTrace, describe_magnification, drift_in_pixels
 from tests.helpers.node_scenes import make_calibration

@@ -25,9 +25,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from semcal_ros.files.images.video_frames import VIDEO_SUFFIXES
 from semcal_ros.files.recordings import RecordedFiles, open_recording
-from semcal_ros.files.video import open_video
+from semcal_ros.files.video import VIDEO_SUFFIXES, open_video
 from semcal_ros.workflows import describe_recording as module
 from semcal_ros.workflows.describe_recording import describe_recording
 from semcal_ros.workflows.simulate import simulate

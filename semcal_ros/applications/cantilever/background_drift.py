@@ -45,16 +45,13 @@ from semcal_ros.core.registration.register import (
 )
 from semcal_ros.core.wording import omit_numbers
 
-__all__ = ["Background", "GroundRegion", "follow_background"]
-
-
 # The rough drift is measured in an image reduced to between 256 and 512 px along its shorter side,
 # by the median shift of its tiles.
 _FIRST_PX = 256
 # Tiles along the shorter side.
 _TILES = 4
 # A region that is further from the median moves by itself, px of the reduced image: ten times the error of the median.
-_OWN_MOTION_PX = 1.0
+_INDEPENDENT_MOTION_PX = 1.0
 # A smaller tile holds too little texture for a peak that stands out.
 _LEAST_TILE_PX = 64
 # The median of three is right even if one of them is wrong.
@@ -73,7 +70,7 @@ _ROUGH_PX = 0.4
 # 3 nm where that is 2 px wrong, and a static edge that is compared with a place beside it seems to move. So it is
 # tracked again with the drift that was found ...
 _PASSES = 3
-# ... unless this is the shift that was used, px: a tenth of the error that is known to do harm.
+# ... unless that differs from the drift that was used by less than this, px: a tenth of an error that does harm.
 _SAME_PX = 0.15
 # A body counts as moving if at least this many of its cells change ...
 _LEAST_CELLS = 4
@@ -254,19 +251,19 @@ def _estimate_rough_drift(
         if len(good) >= min(_LEAST_TILES, len(tiles)) and good:
             shift = np.asarray(np.median(np.array(good), axis=0))
         shifts.append(shift.copy())
-        for own, one in zip(failures, found, strict=True):
-            own.append(one.rejection or _find_own_motion(one.shift_px - shift))
+        for of_region, one in zip(failures, found, strict=True):
+            of_region.append(one.rejection or _find_independent_motion(one.shift_px - shift))
     regions = tuple(
-        GroundRegion((part[1].start, part[0].start, part[1].stop, part[0].stop), tuple(own))
-        for (part, _), own in zip(tiles, failures, strict=True)
+        GroundRegion((part[1].start, part[0].start, part[1].stop, part[0].stop), tuple(of_region))
+        for (part, _), of_region in zip(tiles, failures, strict=True)
     )
     return np.array(shifts), regions
 
 
-def _find_own_motion(against_px: Array) -> Rejection[MatchFailure] | None:
+def _find_independent_motion(against_px: Array) -> Rejection[MatchFailure] | None:
     """Say so where a region moves against the others by more than they are known."""
     away_px = float(np.hypot(*against_px))
-    if away_px <= _OWN_MOTION_PX:
+    if away_px <= _INDEPENDENT_MOTION_PX:
         return None
     return Rejection(MatchFailure.OUTLIER, f"moves against the others by {away_px:.2g} px")
 

@@ -36,20 +36,6 @@ from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 
-__all__ = [
-    "SHAPES",
-    "Bending",
-    "Shape",
-    "evaluate_bending",
-    "expect_point_load",
-    "fit_bending",
-    "fit_common_shape",
-    "locate_end",
-    "locate_load",
-    "parse_shape",
-]
-
-
 SHAPES = ("free", "beam", "parabola")
 
 # 1-sigma of the rotation between frames, rad: the raster and a clamp are that stable.
@@ -276,8 +262,8 @@ def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count
     usable = power > _TINY
     if int(usable.sum()) < _LEAST:
         return 1.0
-    own = reference_count / (reference_count + 1.0)
-    ratio = float(np.mean(grown[usable] ** 2 / power[usable])) / own
+    expected = reference_count / (reference_count + 1.0)
+    ratio = float(np.mean(grown[usable] ** 2 / power[usable])) / expected
     # The fits with a free shape have taken what their four terms explain out of the residuals. With
     # narrow priors on r0 and r1 it is less, so the excess may come out a little too large.
     number = float(usable.sum())
@@ -392,14 +378,14 @@ def _fit_robustly(
     weight = np.ones(len(seen))
     scale = 1.0
     solution: Array = np.zeros(rows.shape[1])
-    for turn in range(_ROUNDS):
+    for iteration in range(_ROUNDS):
         total = weight * plain / scale**2
         normal = (rows * total[:, None]).T @ rows + np.diag(prior)
         solution = np.asarray(np.linalg.solve(normal, (rows * total[:, None]).T @ seen))
         residual = (seen - rows @ solution) / sigma
         scale = max(mad_sigma(residual), 0.8)
         # The first rounds do not yet know what is an outlier.
-        far = residual / (scale * _TUKEY * (2.0 if turn < 3 else 1.0))
+        far = residual / (scale * _TUKEY * (2.0 if iteration < 3 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
         if int(np.count_nonzero(weight > _LEAST_WEIGHT)) < _LEAST:
             return None

@@ -29,18 +29,6 @@ from scipy.special import ndtr
 
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 
-__all__ = [
-    "EdgeFit",
-    "EdgeModel",
-    "StepFit",
-    "choose_width",
-    "find_unchanged_width",
-    "fit_blocks",
-    "fit_edges",
-    "fit_step",
-]
-
-
 # Gauss-Newton steps. The first one finds the grey levels only; each later one moves the edge by at
 # most half the reach, so that two can bring it anywhere within reach and two more settle it.
 _STEPS = 5
@@ -216,11 +204,11 @@ def fit_blocks(
     width, reach = model.width_m, model.reach_m
     information = np.zeros((count, 3, 3))
     squares, weight_sum = low.copy(), low.copy()
-    for turn in range(_STEPS):
+    for iteration in range(_STEPS):
         z = distance - place[block]
         taper = np.where(np.abs(z) < reach, np.cos(0.5 * np.pi * z / reach) ** 2, 0.0)
         shape = ndtr(z / width)
-        if turn == 0:
+        if iteration == 0:
             third = np.zeros_like(z)
         else:
             # Scaled by the width, so that the equations are well conditioned.
@@ -229,7 +217,7 @@ def fit_blocks(
         information = _accumulate_normal(block, taper, columns, count)
         sums = [np.bincount(block, taper * c * grey, count) for c in columns]
         right = np.asarray(np.stack(sums, axis=1), dtype=np.float64)
-        if turn == 0:
+        if iteration == 0:
             information[:, 2, 2] = 1.0
         solution = _solve_guarded(information, right)
         low, step = solution[:, 0], solution[:, 1]

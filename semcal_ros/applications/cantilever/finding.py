@@ -29,9 +29,6 @@ from numpy.typing import ArrayLike, NDArray
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Strip", "find_strip"]
-
-
 # Larger images are reduced to this size before they are searched.
 _SEARCHED_PX = 640
 # All directions are searched in an image of at most this size.
@@ -502,12 +499,12 @@ def _measure_freedom(
         return float(np.nanmean(values)) if np.isfinite(values).mean() > 0.5 else float("nan")
 
     inside = level(-beyond, spread)
-    beside = level(-beyond, np.concatenate([spread - away, spread + away]))
+    background = level(-beyond, np.concatenate([spread - away, spread + away]))
     outside = [level(beyond, spread + shift) for shift in (-away, 0.0, away)]
     known = [v for v in outside if np.isfinite(v)]
     if not np.isfinite(outside[1]) or not known:
         return float("nan")
-    return (inside - float(np.median(known))) / max(inside - beside, 1e-9)
+    return (inside - float(np.median(known))) / max(inside - background, 1e-9)
 
 
 def _decide_ends(ends: list[Array], seen: list[bool], free: list[float], half: float) -> Strip:

@@ -31,9 +31,6 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 
-__all__ = ["Axis", "PlaneMap", "evaluate_drift"]
-
-
 # Spacing of the nodes at which the distortion is undone: a hundredth of the pixels. Distortion is
 # smooth, so a spline through the nodes gives the others.
 _NODE_SPACING_PX = 10.0

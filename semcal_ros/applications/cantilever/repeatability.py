@@ -26,8 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Repeatability", "compare_series", "describe_disagreement", "group_frames"]
-
 # Spread over what the sigmas predict from which a note says so: of three magnifications, chance makes one in 500 exceed
 # it even if the errors of all poses are the same.
 _LARGE_SPREAD = 2.5
@@ -187,8 +185,8 @@ def _average_poses(
             noise = np.array([f.noise_m for f in chosen])
             share = 1.0 / (len(parts[0]) + 1.0)
             common = float(weight @ (sigmas**2 - noise**2)) + share * float(weight @ noise**2)
-            own = (1.0 - share) * float(np.sum(weight**2 * noise**2))
-            sigma[row, column] = float(np.sqrt(max(common + own, 0.0)))
+            independent = (1.0 - share) * float(np.sum(weight**2 * noise**2))
+            sigma[row, column] = float(np.sqrt(max(common + independent, 0.0)))
     return value, sigma
 
 

@@ -59,9 +59,6 @@ from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted, omit_numbers
 
-__all__ = ["Deflection", "Series", "SeriesSettings", "measure_series"]
-
-
 # Range of an edge's step over that in the reference within which it counts as the same edge.
 _SAME_STEP = (0.5, 1.6)
 # What makers of cantilevers state of the length, as a fraction of it. A larger difference is told. As a uniform
@@ -508,21 +505,25 @@ class _SeriesMeasurement:
             on_frame()
         shape = parse_shape(self._settings.shape)
         others = [f for k, f in enumerate(free) if k not in reference]
-        own = [free[k].covariance[1, 1] for k in reference]
-        common = fit_common_shape(others, float(np.sqrt(np.mean(own) / len(own))), len(own))
+        variances = [free[k].covariance[1, 1] for k in reference]
+        common = fit_common_shape(
+            others, float(np.sqrt(np.mean(variances) / len(variances))), len(variances)
+        )
         misfit = None
         if shape is None:
             u = undeformed.model.centres_m / self._settings.length_m
             shape = expect_point_load(common, locate_load(u, others))
         else:
             shape, misfit = _compare_shapes(shape, common)
-        bent = [self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)]
+        bendings = [
+            self._bending(k, fit, undeformed, reference, shape) for k, fit in enumerate(edges)
+        ]
         doubts = [
             misfit,
             self._describe_end_slip(np.array(ends_m), reference),
             self._describe_base_slip(bases, reference),
         ]
-        results = [self._result(k, one, undeformed) for k, one in enumerate(bent)]
+        results = [self._result(k, one, undeformed) for k, one in enumerate(bendings)]
         return results, shape, tuple(doubt for doubt in doubts if doubt is not None)
 
     def _find_end(self, samples: PixelSamples, undeformed: UndeformedBeam) -> float:
@@ -586,10 +587,10 @@ class _SeriesMeasurement:
         for end in ends[np.abs(ends) <= reach]:
             away = np.abs(across - end * line) - model.half_width_m
             within = (away < 0.0) & (away > -model.reach_m)
-            beside = (away > 0.0) & (away < model.reach_m)
-            if not (within.any() and beside.any()):
+            outside = (away > 0.0) & (away < model.reach_m)
+            if not (within.any() and outside.any()):
                 continue
-            contrast = float(grey[within].mean() - grey[beside].mean())
+            contrast = float(grey[within].mean() - grey[outside].mean())
             if contrast > best:
                 best, found = contrast, float(end)
         return terms if abs(found - now) < step else found * np.array([1.5, -0.5])

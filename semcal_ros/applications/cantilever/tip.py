@@ -34,8 +34,6 @@ from scipy.spatial import KDTree
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_blocks
 from semcal_ros.core.arrays import Array, mad_sigma
 
-__all__ = ["ROUGH_APEX_PX", "TipFit", "find_apex", "fit_tip"]
-
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
 
@@ -171,9 +169,9 @@ def find_apex(samples: PixelSamples, end_m: float, half_m: float, px_m: float) -
     along, across, grey = samples
     middle = np.abs(across) < max(_MIDDLE * half_m, 2.0 * px_m)
     middle &= np.abs(along - end_m) < _SEARCH * half_m
-    beside = np.abs(along - end_m) < _SEARCH * half_m
-    beside &= (np.abs(across) > 1.3 * half_m) & (np.abs(across) < 2.5 * half_m)
-    if not (middle.any() and beside.any()):
+    background = np.abs(along - end_m) < _SEARCH * half_m
+    background &= (np.abs(across) > 1.3 * half_m) & (np.abs(across) < 2.5 * half_m)
+    if not (middle.any() and background.any()):
         return end_m
     first, size = float(along[middle].min()), _APEX_BIN_PX * px_m
     bins = np.floor((along[middle] - first) / size).astype(np.intp)
@@ -184,7 +182,7 @@ def find_apex(samples: PixelSamples, end_m: float, half_m: float, px_m: float) -
     inner = profile[: max(int((end_m - half_m - first) / size), 0)]
     if inner.size == 0:
         return end_m
-    beam, ground = float(np.median(inner)), float(np.median(grey[beside]))
+    beam, ground = float(np.median(inner)), float(np.median(grey[background]))
     if not beam > ground:
         return end_m
     # The most likely change between two known levels in noise.
@@ -221,9 +219,9 @@ def fit_tip(samples: PixelSamples, rough_m: float, model: EdgeModel, px_m: float
     best_one = int(np.argmin(cost))
     likely = np.exp(-0.5 * (cost - cost[best_one]) / scale[best_one] ** 2)
     likely /= likely.sum()
-    apexes, own = np.array([fit[0].apex for fit in fits]), np.array([fit[1] for fit in fits])
+    apexes, sigmas = np.array([fit[0].apex for fit in fits]), np.array([fit[1] for fit in fits])
     apex = float(likely @ apexes)
-    spread = likely @ (own**2 + (apexes - apex) ** 2)
+    spread = likely @ (sigmas**2 + (apexes - apex) ** 2)
     sigma = float(np.sqrt(spread + (_RIM_PX * px_m) ** 2))
     best = fits[int(np.argmax(likely))][0]
     return TipFit(apex, sigma, best.length, 2.0 * best.facet, best.flank)
@@ -377,13 +375,13 @@ def _solve_robustly(
         return None
     weight, scale = np.ones(len(seen)), 1.0
     known = 1.0 / expected_sigma**2
-    for turn in range(8):
+    for iteration in range(8):
         total = weight / (scale * sigma) ** 2
         inverse = np.linalg.inv((design * total[:, None]).T @ design + np.diag(known))
         solution = inverse @ ((design * total[:, None]).T @ seen + known * expected)
         left = (seen - design @ solution) / sigma
         scale = max(mad_sigma(left), 1.0)
-        far = left / (scale * _TUKEY * (2.0 if turn < 2 else 1.0))
+        far = left / (scale * _TUKEY * (2.0 if iteration < 2 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
         if int(np.count_nonzero(weight > 0.05)) < design.shape[1] + _EXCESS_BLOCKS:
             return None

@@ -33,8 +33,6 @@ from semcal_ros.applications.cantilever.tip import ROUGH_APEX_PX, fit_tip
 from semcal_ros.core.arrays import Array, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["REACH_PX", "PixelSamples", "UndeformedBeam", "fit_base_edge", "measure_undeformed_beam"]
-
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
 
@@ -55,11 +53,11 @@ _REACH_OF_HALF_WIDTH = 1.5
 _END_SEARCH_PX = 14.0
 # The holder's edge is fitted between these distances from the beam: beyond the blur of the beam's
 # own edge, and no further than the holder may be taken for straight.
-_BESIDE_PX = 3.0
+_HOLDER_FROM_PX = 3.0
 # The far end of that range.
-_BESIDE_REACH_PX = 24.0
-# Turns of the fit of its slope; each leaves less than a tenth of the error.
-_TURNS = 3
+_HOLDER_TO_PX = 24.0
+# Iterations of the fit of its slope; each leaves less than a tenth of the error.
+_ITERATIONS = 3
 
 
 @dataclass(frozen=True)
@@ -180,10 +178,10 @@ def _change_axis(view: PixelSamples, before: Axis, now: Axis) -> PixelSamples:
 def _align_axis(rough: Axis, views: list[PixelSamples], px_m: float) -> tuple[Axis, float]:
     """Fit the axis midway between both edges, and the width of the edges."""
     axis, width_m = rough, _EDGE_PX * px_m
-    for turn in range(4):
+    for iteration in range(4):
         model = _place_blocks(axis, width_m, px_m)
         moved = [_change_axis(view, rough, axis) for view in views]
-        if turn == 2:
+        if iteration == 2:
             width_m = choose_width(*moved[0], model, _predict_straight_edges(model), px_m)
             model = replace(model, width_m=width_m)
         across, sigma, _ = average_edges(
@@ -303,17 +301,17 @@ def fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float
     """
     along, across, grey = view
     away = np.abs(across) - model.half_width_m
-    beside = (away > _BESIDE_PX * px_m) & (away < _BESIDE_REACH_PX * px_m)
-    along, across, grey = along[beside], across[beside], grey[beside]
+    of_holder = (away > _HOLDER_FROM_PX * px_m) & (away < _HOLDER_TO_PX * px_m)
+    along, across, grey = along[of_holder], across[of_holder], grey[of_holder]
     rough_m = _END_SEARCH_PX * px_m
     # From the middle of one side to that of the other.
-    apart_m = 2.0 * model.half_width_m + (_BESIDE_PX + _BESIDE_REACH_PX) * px_m
+    apart_m = 2.0 * model.half_width_m + (_HOLDER_FROM_PX + _HOLDER_TO_PX) * px_m
     slope, place_m, found = 0.0, 0.0, fit_step(at_m - along, grey, model, rough_m=rough_m)
-    for turn in range(_TURNS):
+    for iteration in range(_ITERATIONS):
         distance = at_m - along - slope * across - place_m
-        # After the first turn it is known where to look.
+        # After the first iteration it is known where to look.
         left, right = (
-            fit_step(distance[side], grey[side], model, rough_m=None if turn else rough_m)
+            fit_step(distance[side], grey[side], model, rough_m=None if iteration else rough_m)
             for side in (across < 0.0, across > 0.0)
         )
         if not (np.isfinite(left.place_m) and np.isfinite(right.place_m)):

@@ -36,9 +36,6 @@ from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from
 from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["Adjustment", "adjust"]
-
-
 _ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
 _LEAST_SCALE = 1e-6  # least scale of the residuals, for observations without errors
 _POINT_SPREAD = 3.0  # prior 1-sigma of the points' heights, in units of their spread
@@ -357,8 +354,8 @@ def _finish(
     through = through - through.mean(axis=1, keepdims=True)
     spread = (poses @ through.reshape(len(free), -1)).reshape(through.shape)
     count = len(state.points)
-    own = (1.0 - 2.0 / count) * inverse + inverse.sum(axis=0) / count**2
-    covariance = (own + np.einsum("api,apj->pij", through, spread, optimize=True)) * unit_m**2
+    of_points = (1.0 - 2.0 / count) * inverse + inverse.sum(axis=0) / count**2
+    covariance = (of_points + np.einsum("api,apj->pij", through, spread, optimize=True)) * unit_m**2
     full = np.zeros((6 * problem.views, 6 * problem.views))
     full[np.ix_(free, free)] = poses
     by_view = full.reshape(problem.views, 6, problem.views, 6)

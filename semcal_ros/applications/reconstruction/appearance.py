@@ -12,12 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Images that keep the texture of the specimen and remove its shading.
+"""Shading and texture of the specimen: images without shading, and how brightness depends on the normal.
 
 The yield of secondary electrons grows with the slope of the surface, so shading stays with the
 slope while the texture turns with the specimen: tracked features would be pulled against the
 movement, most of all near the limb. Texture multiplies shading; after a square root (which also
 makes shot noise uniform) and with the local mean and contrast divided out, only texture remains.
+
+Patches keep the logarithm of their grey levels, and the shading in them is estimated. It grows with the angle
+between beam and normal, and depends on the side of the detector: one function of the normal's direction in all views.
+Within a patch this function has a slope, which pulls the patch against the movement of its texture: measured positions
+move less than the specimen does, and a ball comes out too small.
+
+The patches of a point are its texture plus this function along the normals that each view sees. Taking
+the mean of every patch and of every sample over the views removes the texture; what is left is linear in
+the coefficients of the function (a two-way analysis of variance).
 """
 
 from __future__ import annotations
@@ -30,12 +39,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Image, mad_sigma
-
-__all__ = ["Appearance", "compute_log_grey", "convert_for_tracking", "prepare_appearance"]
+from semcal_ros.core.arrays import Array, Image, Indices, mad_sigma
 
 # Second difference along both axes. Its squares sum to 1, so that it keeps the sigma of the noise.
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
+# Degree of the polynomial in X and Y of the normal: a cosine and its square, seen from any side, and shadows
+# as wide as a quarter of the ball.
+_DEGREE = 4
+# The limb: with the logarithm of the cosine and its inverse, all powers between them are reached within a per
+# cent up to 70 degrees.
+_LIMB_TERMS = 4
+# Least squared cosine, at 84 degrees: the limb is not steeper than the beam spot lets it be.
+_LEAST_COSINE2 = 0.01
+# A patch whose error is so many times the median shows something else, an edge or the tip.
+_OUTLIER = 2.5
+# Nodes along X and Y: linear interpolation is then right to 1e-4 of the range of the cosine.
+_NODES = 257
+# Directions of the coefficients that the views hardly determine stay zero.
+_CONDITION = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,3 +131,78 @@ def _estimate_noise(grey: Image) -> float:
     """Estimate pixel noise from second differences, free of most texture (Immerkaer 1996)."""
     rough = cv2.filter2D(grey, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
     return mad_sigma(rough)
+
+
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """Brightness as a function of the normal.
+
+    Attributes
+    ----------
+    table
+        (nodes, nodes) over Y and X of the unit normal in the sem frame, both from -1 to 1; grey levels in
+        the unit of the patches, up to a constant.
+    """
+
+    table: Image
+
+    def evaluate(self, slope: Array) -> Image:
+        """Evaluate at X and Y of unit normals, (n, samples, 2) -> (n, samples)."""
+        at = ((slope + 1.0) * (0.5 * (len(self.table) - 1))).astype(np.float32)
+        out = cv2.remap(
+            self.table, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(out, dtype=np.float32).reshape(at.shape[:2])
+
+
+def fit_shading(slope: Array, grey: Array, point: Indices) -> Shading:
+    """Fit the brightness that patches of the same points share as a function of the normal.
+
+    Parameters
+    ----------
+    slope
+        (patches, samples, 2) X and Y of the unit normals in the sem frame.
+    grey
+        (patches, samples) grey levels; sample k of a point is the same place of the surface in all of its
+        patches.
+    point
+        (patches,) number of the point.
+    """
+    terms = (_DEGREE + 1) * (_DEGREE + 2) // 2 - 1 + _LIMB_TERMS
+    solution = np.zeros(terms)
+    if len(point):
+        basis = _evaluate_basis(slope)
+        basis -= basis.mean(axis=1, keepdims=True)
+        value = grey - grey.mean(axis=1, keepdims=True)
+        keep = np.ones(len(point), dtype=bool)
+        for _ in range(2):
+            rows = _subtract_means(basis[keep], point[keep])
+            right = _subtract_means(value[keep][..., None], point[keep])[..., 0]
+            flat = rows.reshape(-1, terms)
+            scale = np.sqrt(np.mean(flat**2, axis=0)) + 1e-12
+            found = np.linalg.lstsq(flat / scale, right.ravel(), rcond=_CONDITION)[0]
+            solution = found / scale
+            error = np.sqrt(np.mean((right - rows @ solution) ** 2, axis=1))
+            keep[np.flatnonzero(keep)[error > _OUTLIER * np.median(error)]] = False
+    axis = np.linspace(-1.0, 1.0, _NODES)
+    nodes = np.stack(np.meshgrid(axis, axis), axis=-1)
+    return Shading(np.asarray(_evaluate_basis(nodes) @ solution, dtype=np.float32))
+
+
+def _evaluate_basis(slope: Array) -> Array:
+    """Evaluate (..., terms) functions of the normal's X and Y."""
+    x, y = slope[..., 0], slope[..., 1]
+    cosine = np.sqrt(np.maximum(1.0 - x * x - y * y, _LEAST_COSINE2))
+    limb = np.log(cosine)
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i) if i + j]
+    terms = [x**i * y**j for i, j in powers]
+    return np.stack([*terms, limb, limb * x, limb * y, 1.0 / cosine], axis=-1)
+
+
+def _subtract_means(values: Array, point: Indices) -> Array:
+    """Subtract from (patches, samples, terms) the mean over the patches of the same point."""
+    _, index, count = np.unique(point, return_inverse=True, return_counts=True)
+    order = np.argsort(index, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])
+    sums = np.add.reduceat(values[order], starts, axis=0)
+    return np.asarray(values - (sums / count[:, None, None])[index], dtype=np.float64)

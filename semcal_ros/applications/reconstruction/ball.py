@@ -42,9 +42,6 @@ from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.roundness import Roundness, measure_roundness
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 
-__all__ = ["Ball", "measure_ball"]
-
-
 # The jackknife has few degrees of freedom: a larger scatter than this happens by chance once in 20 times.
 _CHANCE = 0.05
 # 1-sigma of what patches are systematically off at the limb, px: with the true poses, the movement of a ball of
@@ -162,8 +159,8 @@ def measure_ball(
 
 def _compute_excess(structure: Structure, sphere: SphereFit) -> float:
     """Compute the part of the squared residuals that the points' own uncertainty does not explain."""
-    own = np.mean(structure.normal_sigma_m[sphere.inliers] ** 2)
-    return float(np.clip(1.0 - own / sphere.rms_m**2, 0.0, 1.0))
+    expected = np.mean(structure.normal_sigma_m[sphere.inliers] ** 2)
+    return float(np.clip(1.0 - expected / sphere.rms_m**2, 0.0, 1.0))
 
 
 def _count_sharing(structure: Structure) -> float:

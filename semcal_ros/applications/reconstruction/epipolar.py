@@ -30,9 +30,6 @@ from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["AffineEpipolar", "fit_epipolar"]
-
-
 # Four pairs define the geometry, a fifth one tests it.
 _LEAST_POINTS = 5
 

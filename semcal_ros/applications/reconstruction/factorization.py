@@ -31,9 +31,6 @@ from semcal_ros.applications.reconstruction.types import Tracks
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 
-__all__ = ["LEAST_COMMON", "AffineStructure", "factorize"]
-
-
 # Numbers of successive views that are tried as the first block: short ones share more points, long
 # ones turn further.
 _WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48)

@@ -39,9 +39,6 @@ from semcal_ros.core.arrays import Array, Indices, Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["SequenceTracker", "TrackKeyframe", "TrackerSettings", "project_to_plane"]
-
-
 # With fewer features left than this, the whole frame is processed: the others may be anywhere.
 _FEW = 30
 

@@ -32,8 +32,6 @@ from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["SurfaceMesh", "triangulate_cloud"]
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:

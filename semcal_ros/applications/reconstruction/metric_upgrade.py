@@ -37,9 +37,6 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["MetricUpgrade", "mirror_structure", "upgrade_to_metric"]
-
-
 # Reverses depth.
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 # Rows and columns of the six different entries of Q.

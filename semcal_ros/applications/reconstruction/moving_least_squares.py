@@ -30,9 +30,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["LocalSurface", "compute_spacing_m", "fit_local_surface"]
-
-
 # Neighbours in a fit, at most: eight for each coefficient of a quadric; bounds time and memory.
 _NEIGHBOURS = 48
 # A quadric has six coefficients; two more show the scatter.
@@ -133,7 +130,7 @@ def _fit_quadrics(cloud: Array, tree: cKDTree, at: Array, radius: float) -> Loca
     freedom = np.maximum(total - 6.0 * total / count, 0.2 * total)
     variance = np.einsum("qk,qk->q", weight, error**2) / freedom
     squared = np.einsum("qk,qki,qkj->qij", weight**2, design, design)
-    own = np.einsum("qi,qij,qj->q", inverse[:, 0], squared, inverse[:, 0])
+    leverage = np.einsum("qi,qij,qj->q", inverse[:, 0], squared, inverse[:, 0])
     slope = found[:, 1:3]
     steep = np.sqrt(1.0 + np.sum(slope**2, axis=1))
     normals = np.stack([np.ones(len(at)), -slope[:, 0], -slope[:, 1]], axis=1) / steep[:, None]
@@ -150,5 +147,5 @@ def _fit_quadrics(cloud: Array, tree: cKDTree, at: Array, radius: float) -> Loca
         at + (found[:, 0] * scale)[:, None] * axes[:, :, 0],
         np.einsum("qij,qj->qi", axes, normals),
         bend / scale,
-        np.sqrt(variance * own) * scale,
+        np.sqrt(variance * leverage) * scale,
     )

@@ -31,24 +31,22 @@ from typing import Any
 import cv2
 import numpy as np
 
+from semcal_ros.applications.reconstruction.appearance import Shading, fit_shading
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, project_to_plane
-from semcal_ros.applications.reconstruction.shading import Shading, fit_shading
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
 
-__all__ = [
-    "WINDOW",
-    "PatchSettings",
-    "PosedSurface",
-    "Starmap",
-    "compute_displacement_m",
-    "measure_patches",
-    "project_to_plane_at_centre",
-]
-
 #: As :func:`itertools.starmap`.
 Starmap = Callable[[Callable[..., Any], Iterable[Sequence[Any]]], Iterator[Any]]
+WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
+# Least contrast of a patch over that of the template. It keeps the division bounded for patches
+# that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
+_GAIN_LEAST = 0.3
+# Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
+_SHADING_POINTS = 100
+# Points whose patches are compared together: of 150 views some 9 MB, a fraction of a second.
+_POINTS_AT_ONCE = 64
 
 
 def compute_displacement_m(
@@ -69,16 +67,6 @@ def project_to_plane_at_centre(frame: TrackKeyframe, scan: ScanTiming | None, ra
     """Project raw pixels (n, 2) to sem-frame X, Y (n, 2) in m at the centre of the acquisition."""
     seen = project_to_plane(frame.camera, raw)
     return seen - compute_displacement_m(frame, scan, raw, seen)
-
-
-WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
-# Least contrast of a patch over that of the template. It keeps the division bounded for patches
-# that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
-_GAIN_LEAST = 0.3
-# Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
-_SHADING_POINTS = 100
-# Points whose patches are compared together: of 150 views some 9 MB, a fraction of a second.
-_POINTS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -347,8 +335,8 @@ def match_points(patches: Image, seen: Mask, half: int) -> tuple[Array, Array, A
         fitted = error + shift[at, point] @ slope.T
         variance = np.sum(window * fitted**2, axis=1) / window.sum()
         covariance[at, point] = variance[:, None, None] * inverse
-        own = np.sum(window * stack**2, axis=1)
-        correlation[at, point] = both / np.sqrt(power * own)
+        power_seen = np.sum(window * stack**2, axis=1)
+        correlation[at, point] = both / np.sqrt(power * power_seen)
     return shift, covariance, correlation
 
 

@@ -51,7 +51,9 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Structure", "StructureSettings", "collect_tracks", "mirror_poses", "reconstruct"]
+# Mean square of a point's residuals over that of the median point. Of points that turn with a ball, 99 of 100
+# are below 2; of those on the outline of its tip, most are above.
+_LARGEST_MISFIT = 2.0
 
 
 @dataclass(frozen=True)
@@ -245,11 +247,6 @@ def mirror_poses(
     """Return the mirror structure, which parallel projection cannot tell from the given one."""
     turned, points = mirror_structure(rotations, points_m)
     return turned, translations_m * np.array([1.0, 1.0, -1.0]), points
-
-
-# Mean square of a point's residuals over that of the median point. Of points that turn with a ball, 99 of 100
-# are below 2; of those on the outline of its tip, most are above.
-_LARGEST_MISFIT = 2.0
 
 
 class _Refinement:

@@ -32,8 +32,6 @@ from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.sphere import SphereFit
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 
-__all__ = ["Roundness", "measure_roundness"]
-
 # Points further off than this part of the radius belong to something else: what holds the ball.
 _FAR = 0.2
 # Angle about such points within which others are left out: the neck of the tip, rad.

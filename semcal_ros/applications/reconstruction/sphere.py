@@ -24,9 +24,6 @@ from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["SphereFit", "fit_sphere"]
-
-
 # Random samples of four points. If only a third of the points is on the sphere, one sample in 81 is
 # good, and all 500 are bad with a probability of 0.2 %.
 _TRIALS = 500

@@ -35,8 +35,6 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
 
-__all__ = ["Disparity", "TiltGeometry", "find_tilt_geometry", "match_densely"]
-
 # Ratio of the distances of the best and the second best descriptor (Lowe 2004, section 7.1).
 _RATIO = 0.8
 # Three times the 0.7 px that a SIFT feature of a coarser octave is uncertain by.

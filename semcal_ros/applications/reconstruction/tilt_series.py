@@ -33,8 +33,6 @@ from semcal_ros.applications.reconstruction.tilt_pair import (
 from semcal_ros.core.arrays import AnyImage, Array, check_positive, mad_sigma
 from semcal_ros.core.errors import InvalidValueError, StructureError
 
-__all__ = ["HeightMap", "measure_heights"]
-
 # Least tilt between two pictures: at 0.5 degrees an error of 0.1 px is one of 11 px in height.
 _LEAST_TILT_RAD = np.radians(0.5)
 # Largest one: beyond it, pictures of rough surfaces hide too much of each other.
@@ -204,14 +202,14 @@ def measure_heights(
     variance += _systematic_variance(
         depth, weights, u, v, pairs, turns, tilt_sigma_rad, tilts_rad[reference]
     )
-    own = tilts_rad[reference]
-    height = depth * np.cos(own) + v * np.sin(own)
+    tilt_rad = tilts_rad[reference]
+    height = depth * np.cos(tilt_rad) + v * np.sin(tilt_rad)
     height -= np.nanmedian(height)
     _check_coverage(height)
     return HeightMap(
         height,
-        np.sqrt(variance) * np.cos(own),
-        noise * np.cos(own),
+        np.sqrt(variance) * np.cos(tilt_rad),
+        noise * np.cos(tilt_rad),
         reference,
         tuple(pairs),
         pixel_size_m,
@@ -334,7 +332,7 @@ def _systematic_variance(
     pairs: list[TiltGeometry],
     turns: list[float],
     tilt_sigma_rad: float,
-    own_rad: float,
+    reference_tilt_rad: float,
 ) -> Array:
     """Variance from the tilts and the epipolar geometry, about the middle of what is seen."""
     seen = np.isfinite(depth)
@@ -351,4 +349,4 @@ def _systematic_variance(
         slant = np.stack([u / np.tan(turn), -u / np.sin(turn), -v / np.tan(turn)]) * weight
         variance += np.einsum("ihw,ij,jhw->hw", slant, pair.covariance, slant)
     # The reading of the reference also turns heights to the normal of the stage.
-    return variance + (tilt_sigma_rad * (total - (v - depth * np.tan(own_rad)))) ** 2
+    return variance + (tilt_sigma_rad * (total - (v - depth * np.tan(reference_tilt_rad)))) ** 2

@@ -25,8 +25,6 @@ from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Observations", "Tracks", "tabulate_cameras"]
-
 
 @dataclass(frozen=True, eq=False)
 class Tracks:

@@ -28,9 +28,6 @@ import numpy as np
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
 from semcal_ros.core.arrays import Array
 
-__all__ = ["AxisObserver"]
-
-
 # Scales that differ by less than this are of one magnification: if the cameras still differ,
 # another calibration has come into force.
 _SAME_SCALE = 0.002

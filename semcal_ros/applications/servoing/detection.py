@@ -12,7 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Find the markers of a target in an image."""
+"""Find the markers of a target in an image, and their corners to a fraction of a pixel.
+
+The corners are where straight lines meet that are fitted to the sides.
+
+Across a side, between white border and black frame, the grey level steps once. Its position follows
+from the mean over a window centred on the side: a step at delta from the middle of a window of
+half-width h makes the mean ``(black (h + delta) + white (h - delta)) / 2h``. Blur does not move it,
+since it is the same to both sides. A line through the steps of a side is known to a few hundredths
+of a pixel, and so are the corners, where two lines meet: the corner of a blurred image itself is
+rounded, and a corner detector finds it further inside.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +33,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semcal_ros.applications.servoing.sides import refine_quads
 from semcal_ros.applications.servoing.target import NestedTarget, dictionary
-from semcal_ros.core.arrays import Array, Mask, check_image
-
-__all__ = ["TargetView", "find_target"]
-
+from semcal_ros.core.arrays import Array, Image, Mask, check_image
 
 # Larger images are averaged down by a whole factor to find the markers; their sides are then
 # measured at full resolution.
@@ -37,6 +43,26 @@ _SEARCHED_PX = 1024
 _SMALLEST_SIDE_PX = 18.0
 # Sigma of the smoothing for the search: a third of the smallest square that can be read.
 _NOISE_BLUR_PX = 1.0
+# Part of a side that is left out at each end, where the window would meet the next side.
+_ENDS = 0.14
+# Half-width of the window as a part of the side, and its limits, px. Border and frame of a marker
+# are wider.
+_WINDOW, _NARROWEST_PX, _WIDEST_PX = 0.11, 2.0, 6.0
+# The windows are laid over the corners found last, at most this often.
+_ROUNDS = 4
+# Movement of the corners after which that ends: what they are uncertain by at best.
+_CONVERGED_PX = 0.02
+# Largest number of places along a side at which its step is measured: more of them cost time, and
+# neighbours that are closer than a pixel share their noise.
+_MOST_PLACES = 96
+# Steps further than this many sigma from the line through the others are dust.
+_OUTLIER = 3.5
+# Steps that scatter by more than this part of the window do not form a line.
+_RAGGED = 0.5
+# Least contrast of a side, in standard deviations of its pixels from the two levels.
+_LEAST_CONTRAST = 2.0
+# The least number of places on a side, also after outliers were left out: three per unknown.
+_LEAST_PLACES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,3 +204,155 @@ def _search_markers(
     keep = (ids < target.size) & np.isin(ids, seen[count == 1])
     keep &= sides.min(axis=1) >= _SMALLEST_SIDE_PX
     return ids[keep], (corners[keep] + 0.5) * factor - 0.5
+
+
+@dataclass(frozen=True)
+class RefinedQuads:
+    """Corners of n markers.
+
+    Attributes
+    ----------
+    xy
+        (n, 4, 2) px.
+    covariance_px2
+        (n, 8, 8) of the corners ``x0, y0, x1, ...`` of each.
+    good
+        (n,) whether all four sides were found.
+    """
+
+    xy: Array
+    covariance_px2: Array
+    good: Mask
+
+
+@dataclass(frozen=True)
+class _Line:
+    """Steps along one side: ``offset + slope * tau`` outward, tau from its middle, px."""
+
+    offset: float
+    slope: float
+    offset_variance: float
+    slope_variance: float
+
+
+def refine_quads(image: Image, corners: Array) -> RefinedQuads:
+    """Refine the corners (n, 4, 2) of dark markers on white, in order, given to about 2 px."""
+    count = len(corners)
+    xy, covariance = np.array(corners, dtype=np.float64), np.zeros((count, 8, 8))
+    good = np.zeros(count, dtype=np.bool_)
+    for index in range(count):
+        refined = _refine_quad(image, xy[index])
+        if refined is not None:
+            xy[index], covariance[index] = refined
+            good[index] = True
+    return RefinedQuads(xy, covariance, good)
+
+
+def _refine_quad(image: Image, quad: Array) -> tuple[Array, Array] | None:
+    covariance = np.zeros((8, 8))
+    for _ in range(_ROUNDS):
+        before = quad
+        found = [
+            _measure_side(image, quad[side], quad[(side + 1) % 4], _compute_winding(quad))
+            for side in range(4)
+        ]
+        lines = [line for line in found if line is not None]
+        if len(lines) < 4:
+            return None
+        quad, covariance = _intersect_lines(quad, lines)
+        if not np.all(np.isfinite(quad)):
+            return None
+        if float(np.max(np.abs(quad - before))) < _CONVERGED_PX:
+            break
+    return quad, covariance
+
+
+def _compute_winding(quad: Array) -> float:
+    x, y = quad[:, 0], quad[:, 1]
+    return float(np.sign(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
+
+
+def _make_side_frame(first: Array, second: Array, winding: float) -> tuple[float, Array, Array]:
+    """Compute the length of a side, and the unit vectors along it and outward."""
+    along = second - first
+    length = float(np.hypot(along[0], along[1]))
+    along = along / max(length, 1e-9)
+    outward = winding * np.array([along[1], -along[0]])
+    return length, along, outward
+
+
+def _measure_side(image: Image, first: Array, second: Array, winding: float) -> _Line | None:
+    length, along, outward = _make_side_frame(first, second, winding)
+    places = int(min((1.0 - 2.0 * _ENDS) * length, _MOST_PLACES))
+    if places < _LEAST_PLACES:
+        return None
+    half = float(np.clip(_WINDOW * length, _NARROWEST_PX, _WIDEST_PX))
+    tau = np.linspace(_ENDS - 0.5, 0.5 - _ENDS, places) * length
+    across = np.linspace(-half, half, 2 * int(np.ceil(2.0 * half)) + 1)
+    middle = 0.5 * (first + second)
+    xy = middle + tau[:, None, None] * along + across[None, :, None] * outward
+    height, width = image.shape
+    if xy.min() < 0.0 or xy[..., 0].max() > width - 1 or xy[..., 1].max() > height - 1:
+        return None
+    seen = cv2.remap(
+        image,
+        xy[..., 0].astype(np.float32),
+        xy[..., 1].astype(np.float32),
+        cv2.INTER_LINEAR,
+    ).astype(np.float64)
+    inner, outer = across < -0.5 * half, across > 0.5 * half
+    black, white = float(seen[:, inner].mean()), float(seen[:, outer].mean())
+    rough = 0.5 * float(seen[:, inner].std() + seen[:, outer].std())
+    if white - black < _LEAST_CONTRAST * rough or white <= black:
+        return None
+    # The trapezoidal mean: the two ends of the window count half.
+    mean = (seen.sum(axis=1) - 0.5 * (seen[:, 0] + seen[:, -1])) / (seen.shape[1] - 1)
+    step = half * (black + white - 2.0 * mean) / (white - black)
+    return _fit_line(tau, np.clip(step, -half, half), half)
+
+
+def _fit_line(tau: Array, step: Array, half: float) -> _Line | None:
+    keep = np.ones(len(tau), dtype=np.bool_)
+    offset = slope = sigma = 0.0
+    for _ in range(2):
+        if int(keep.sum()) < _LEAST_PLACES:
+            return None
+        design = np.column_stack([np.ones(int(keep.sum())), tau[keep]])
+        (offset, slope), *_ = np.linalg.lstsq(design, step[keep], rcond=None)
+        left = step - offset - slope * tau
+        sigma = float(np.sqrt(np.sum(left[keep] ** 2) / max(int(keep.sum()) - 2, 1)))
+        keep = np.abs(left) <= max(_OUTLIER * sigma, 1e-6)
+    count = int(keep.sum())
+    if count < _LEAST_PLACES or sigma > _RAGGED * half:
+        return None
+    centred = tau[keep] - tau[keep].mean()
+    # Neighbouring places share pixels through interpolation, partly even when a px or two apart.
+    variance = max(sigma, 1e-3) ** 2 * 1.5
+    return _Line(
+        float(offset), float(slope), variance / count, variance / float(np.sum(centred**2))
+    )
+
+
+def _intersect_lines(quad: Array, lines: list[_Line]) -> tuple[Array, Array]:
+    """Intersect neighbouring lines: corners and their (8, 8) covariance."""
+    winding = _compute_winding(quad)
+    frames = [_make_side_frame(quad[k], quad[(k + 1) % 4], winding) for k in range(4)]
+    moved, gradient = np.empty((4, 2)), np.zeros((8, 8))
+    for corner in range(4):
+        # The corner ends the side before it and begins its own.
+        sides = ((corner - 1) % 4, corner)
+        normals = np.stack([frames[side][2] for side in sides])
+        taus = [0.5 * frames[sides[0]][0], -0.5 * frames[sides[1]][0]]
+        shifts = np.array(
+            [lines[s].offset + lines[s].slope * t for s, t in zip(sides, taus, strict=True)]
+        )
+        inverse = (
+            np.linalg.inv(normals) if abs(np.linalg.det(normals)) > 0.1 else np.full((2, 2), np.nan)
+        )
+        moved[corner] = quad[corner] + inverse @ shifts
+        rows = slice(2 * corner, 2 * corner + 2)
+        for place, (side, tau) in enumerate(zip(sides, taus, strict=True)):
+            gradient[rows, 2 * side] = inverse[:, place]
+            gradient[rows, 2 * side + 1] = inverse[:, place] * tau
+    variances = np.array([v for line in lines for v in (line.offset_variance, line.slope_variance)])
+    return moved, (gradient * variances) @ gradient.T

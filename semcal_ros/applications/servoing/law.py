@@ -47,9 +47,6 @@ from semcal_ros.applications.servoing.settings import ServoSettings
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError, Rejection
 
-__all__ = ["Servo", "ServoStatus", "ServoStep"]
-
-
 # Largest part of the error that is removed per frame. With the latency predicted, up to 2 is
 # stable; without prediction 0.5 is still stable for a latency of two frames, whose limit is 0.618.
 _MOST_PER_FRAME = 0.5
@@ -333,8 +330,10 @@ class Servo:
         twist, limited = self._limit(twist, fit, camera, interval_s)
         sigma_px = _compute_origin_sigma(fit, camera)[1]
         error = fit.pose.minus(self.goal)
-        own = fit.view.target_xy_m.reshape(-1, 2)
-        away = camera.project(fit.pose.apply(own)) - camera.project(self.goal.apply(own))
+        target_xy_m = fit.view.target_xy_m.reshape(-1, 2)
+        away = camera.project(fit.pose.apply(target_xy_m)) - camera.project(
+            self.goal.apply(target_xy_m)
+        )
         error_px = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
         is_near = error_px <= limits.tolerance_px and 2.0 * sigma_px <= limits.tolerance_px
         self._near = self._near + 1 if is_near else 0
@@ -360,11 +359,11 @@ class Servo:
 
     def _correction(self, fit: PoseFit, camera: PlaneCamera, ahead: PlanePose) -> Array:
         """Compute the (3,) stage travel that separates features and goal, to second order."""
-        own = fit.view.target_xy_m.reshape(-1, 2)
+        target_xy_m = fit.view.target_xy_m.reshape(-1, 2)
         # Predicted features: these are servoed, not the pose.
-        seen = fit.view.xy.reshape(-1, 2) - camera.project(fit.pose.apply(own))
-        features = camera.project(ahead.apply(own)) + seen
-        wanted = camera.project(self.goal.apply(own))
+        seen = fit.view.xy.reshape(-1, 2) - camera.project(fit.pose.apply(target_xy_m))
+        features = camera.project(ahead.apply(target_xy_m)) + seen
+        wanted = camera.project(self.goal.apply(target_xy_m))
         here = compute_interaction_matrix(camera, features, self._axis(ahead))
         there = compute_interaction_matrix(camera, wanted, self._axis(self.goal))
         # The mean of both ends is right to the second order (Chaumette and Hutchinson 2006).

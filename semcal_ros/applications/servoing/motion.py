@@ -24,9 +24,6 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["CommandHistory", "DisturbanceObserver", "StageMonitor"]
-
-
 # Commands that are kept: those of 30 s, the longest latency that is predicted, at 34 a second.
 _KEPT = 1024
 # Deviations (sigma) beyond which an innovation is not drift, and how many of them in a row are
@@ -34,6 +31,10 @@ _KEPT = 1024
 _GATE, _ODD = 5.0, 4
 # Factor on the expected drift in that case.
 _WIDER = 10.0
+# Commanded travel after which the stage is judged: well above drift and noise in that time.
+_JUDGED_PX = 36.0
+# Least and largest part of the commanded travel that must be seen.
+_LEAST, _MOST = 0.3, 3.0
 
 
 class CommandHistory:
@@ -94,7 +95,7 @@ class DisturbanceObserver:
         self.velocity_m_s: Array = np.zeros(2)
         self.variance: Array = np.full(2, sigma_m_s**2)
 
-    def update(self, interval_s: float, beside_m: Array, variance_m2: Array) -> None:
+    def update(self, interval_s: float, unexplained_m: Array, variance_m2: Array) -> None:
         """Update the filter with motion in an interval that the commands do not explain.
 
         An innovation far beyond expectation is a knock on the stage and not drift, unless it
@@ -110,7 +111,7 @@ class DisturbanceObserver:
         if interval_s <= 0.0:
             return
         self.variance = self.variance + self._change**2 * interval_s
-        surprise = beside_m / interval_s - self.velocity_m_s
+        surprise = unexplained_m / interval_s - self.velocity_m_s
         spread = self.variance + variance_m2 / interval_s**2 + 1e-30
         if np.any(surprise**2 > _GATE**2 * spread):
             self._odd += 1
@@ -122,12 +123,6 @@ class DisturbanceObserver:
         gain = self.variance / spread
         self.velocity_m_s = self.velocity_m_s + gain * surprise
         self.variance = (1.0 - gain) * self.variance
-
-
-# Commanded travel after which the stage is judged: well above drift and noise in that time.
-_JUDGED_PX = 36.0
-# Least and largest part of the commanded travel that must be seen.
-_LEAST, _MOST = 0.3, 3.0
 
 
 class StageMonitor:

@@ -26,9 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PlaneCamera", "choose_projection"]
-
-
 # Relative difference of two matrices from the same numbers, one divided and multiplied by rho
 # again.
 _SAME = 1e-9
@@ -93,9 +90,9 @@ class PlaneCamera:
     @classmethod
     def from_camera(cls, camera: ScanCamera, height_m: float = 0.0) -> PlaneCamera:
         """Create from a camera, for images that were rectified with it."""
-        own = camera.rectified
-        known = None if own.covariance is None else own.P_affine_covariance
-        return cls.from_projection(own.P_affine, height_m, known)
+        rectified = camera.rectified
+        known = None if rectified.covariance is None else rectified.P_affine_covariance
+        return cls.from_projection(rectified.P_affine, height_m, known)
 
     def project(self, xy_m: ArrayLike) -> Array:
         """Project points (n, 2) of the plane, m, to rectified pixels (n, 2)."""
@@ -163,11 +160,11 @@ def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
     InvalidValueError
         No projection belongs to this frame, or the frame has no camera.
     """
-    own = np.asarray(k, dtype=np.float64).reshape(3, 3)
+    of_frame = np.asarray(k, dtype=np.float64).reshape(3, 3)
     known = [np.asarray(p, dtype=np.float64).reshape(3, 4) for p in projections]
-    if not np.all(np.isfinite(own)):
+    if not np.all(np.isfinite(of_frame)):
         raise InvalidValueError("a K that is not finite", expected="finite numbers")
-    if not np.any(own):
+    if not np.any(of_frame):
         if known and known[-1][2, 2] == 0.0 and known[-1][2, 3] != 0.0:
             return known[-1]
         raise InvalidValueError(
@@ -176,7 +173,7 @@ def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
             do="calibrate the stream",
         )
     for matrix in reversed(known):
-        expected = matrix[2, 2] * own
+        expected = matrix[2, 2] * of_frame
         if np.allclose(matrix[:, :3], expected, rtol=_SAME, atol=_SAME * abs(matrix[2, 2])):
             return matrix
     raise InvalidValueError(

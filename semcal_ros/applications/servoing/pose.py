@@ -28,9 +28,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["PlanePose", "PoseFit", "compute_interaction_matrix", "fit_pose"]
-
-
 # Gauss-Newton steps, at most: from the similarity they converge quadratically or not at all.
 _MOST_STEPS = 12
 # Movement of the corners in the last step, px: far below their errors.
@@ -163,11 +160,11 @@ def _reject(view: TargetView, reason: str) -> PoseFit:
 def _fit_similarity(view: TargetView, camera: PlaneCamera) -> tuple[PlanePose, float]:
     """Fit pose and scale by least squares in the plane, as complex b = scale exp(i angle) a + c."""
     seen = camera.plane_from_px(view.xy.reshape(-1, 2)) @ np.array([1.0, 1.0j])
-    own = view.target_xy_m.reshape(-1, 2) @ np.array([1.0, 1.0j])
+    target = view.target_xy_m.reshape(-1, 2) @ np.array([1.0, 1.0j])
     # Small markers are located as well as large ones in px, but constrain the whole less.
-    spread = own - own.mean()
+    spread = target - target.mean()
     factor = complex(np.sum(np.conj(spread) * (seen - seen.mean())) / np.sum(np.abs(spread) ** 2))
-    origin = complex(seen.mean() - factor * own.mean())
+    origin = complex(seen.mean() - factor * target.mean())
     return PlanePose(origin.real, origin.imag, float(np.angle(factor))), abs(factor)
 
 
@@ -184,10 +181,10 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
     whitening = _form_whitening(view)
     pose, converged = start, False
     design, residual = np.empty((0, 3)), np.empty(0)
-    own = view.target_xy_m.reshape(-1, 2)
+    target_xy_m = view.target_xy_m.reshape(-1, 2)
     for _ in range(_MOST_STEPS):
         residual = _whiten(whitening, _compute_residual(view, camera, pose))
-        moved = pose.apply(own)
+        moved = pose.apply(target_xy_m)
         slope = compute_interaction_of_points(camera, moved, pose.values[:2])
         design = _whiten(whitening, slope.reshape(len(view.ids), 8, 3))
         # Columns of m and rad differ by seven orders of magnitude.

@@ -20,8 +20,6 @@ from dataclasses import dataclass
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["ServoSettings"]
-
 
 @dataclass(frozen=True)
 class ServoSettings:

@@ -32,9 +32,6 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["CELLS", "MARKER_BITS", "RATIO", "SIDE", "NestedTarget", "dictionary"]
-
-
 # The middle cell of the 3 x 3 holds the next board.
 RATIO = 3
 """How many times smaller the next board is."""

@@ -26,13 +26,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "CalibratedFrame",
-    "Positions",
-    "describe_missing_camera",
-    "rectified_projection",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Positions:
@@ -188,11 +181,11 @@ class CalibratedFrame:
             by[:, k, 8:] = -values[:, k : k + 1] * homogeneous / seen[:, 2:]
         covariance = by @ self.P_covariance @ np.swapaxes(by, 1, 2)
         matrix = self.P[:2, :2] / seen[:, 2, None, None]
-        own = sigma_m**2 * np.eye(2) + self.drift_covariance
-        if not np.all(np.isfinite(own)):
+        in_plane = sigma_m**2 * np.eye(2) + self.drift_covariance
+        if not np.all(np.isfinite(in_plane)):
             # A drift that was never measured.
             return Positions(values, np.broadcast_to(np.diag([np.inf, np.inf]), covariance.shape))
-        covariance += matrix @ own @ np.swapaxes(matrix, 1, 2)
+        covariance += matrix @ in_plane @ np.swapaxes(matrix, 1, 2)
         return Positions(values, covariance)
 
     def _unproject(self, uv: Array, height_m: float) -> tuple[Array, Array, Array]:

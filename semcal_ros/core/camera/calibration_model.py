@@ -33,19 +33,6 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "ALL_FUNCTIONS",
-    "FUNCTION_NAMES",
-    "TERM_NAMES",
-    "CalibrationModel",
-    "Origin",
-    "ScaleSigma",
-    "checked_magnification",
-    "design_matrix",
-    "names_of",
-    "pixel_size_gradient",
-]
-
 #: What tells a camera: a grid, a specimen, or neither.
 Origin = Literal["grid", "specimen", "extrapolated"]
 

@@ -20,32 +20,19 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from semcal_ros.core.camera.thresholds import (
+    CONDITION_TOLERANCE,
+    DISTANCE_TOLERANCE,
+    ROTATION_TOLERANCE_RAD,
+    VOLTAGE_TOLERANCE,
+)
 from semcal_ros.core.wording import printable
-
-__all__ = [
-    "FILE_NAMES",
-    "ConditionDifference",
-    "compare_conditions",
-    "describe_condition",
-    "format_time",
-]
 
 FILE_NAMES: Mapping[str, str] = {
     "accelerating_voltage_v": "acceleration_voltage_v",
     "serial": "serial_number",
 }
 """What image and calibration files call conditions that have another name on the topic."""
-
-# High-voltage supplies are stable and read back to far less than 1 %, and lens fields that are focused again follow
-# the voltage: 1 % is neither reached by a reading's scatter nor does it change a magnification by more than that.
-_VOLTAGE_TOLERANCE = 0.01
-# A working distance follows each focusing: 1 % is 0.1 mm at 10 mm, less than the focus of a flat specimen scatters.
-_DISTANCE_TOLERANCE = 0.01
-# 0.5 degrees, the 1-sigma that the configuration assumes of a stage's rotation. An aspect ratio of 1 % that is turned
-# by so much becomes a skew of 2e-4.
-_ROTATION_TOLERANCE_RAD = 0.0087
-# Makers' programs round what they show: 1 % of a current or a time is no difference.
-_OTHER_TOLERANCE = 0.01
 
 
 def format_time(time_s: float) -> str:
@@ -179,10 +166,10 @@ def compare_conditions(
         if not values or value is None:
             continue
         if _differs(name, values, value, height_sigma_m):
-            own = describe_condition(name, (value,))[1]
+            value_text = describe_condition(name, (value,))[1]
             found.append(
                 ConditionDifference(
-                    name, own, describe_condition(name, values)[1], name in _DECISIVE
+                    name, value_text, describe_condition(name, values)[1], name in _DECISIVE
                 )
             )
     return tuple(found)
@@ -195,27 +182,27 @@ def _differs(
         texts = {known.strip().casefold() for known in values if isinstance(known, str)}
         if not isinstance(value, str) or len(texts) < len(values):
             return False
-        own = value.strip().casefold()
-        if name == "maker" and _NO_MAKER in (own, *texts):
+        word = value.strip().casefold()
+        if name == "maker" and _NO_MAKER in (word, *texts):
             return False
-        return bool(own) and own not in texts
+        return bool(word) and word not in texts
     numbers = [float(known) for known in values]
-    low, high, own_value = min(numbers), max(numbers), float(value)
-    if not all(map(math.isfinite, (low, high, own_value))):
+    low, high, number = min(numbers), max(numbers), float(value)
+    if not all(map(math.isfinite, (low, high, number))):
         return False
     if name == "scan_rotation_rad":
         # The whole turn that brings it next to the middle of the range.
         middle = 0.5 * (low + high)
-        own_value = middle + math.remainder(own_value - middle, 2.0 * math.pi)
-        return not low - _ROTATION_TOLERANCE_RAD <= own_value <= high + _ROTATION_TOLERANCE_RAD
+        number = middle + math.remainder(number - middle, 2.0 * math.pi)
+        return not low - ROTATION_TOLERANCE_RAD <= number <= high + ROTATION_TOLERANCE_RAD
     relative = {
-        "acceleration_voltage_v": _VOLTAGE_TOLERANCE,
-        "working_distance_m": _DISTANCE_TOLERANCE,
-    }.get(name, _OTHER_TOLERANCE)
+        "acceleration_voltage_v": VOLTAGE_TOLERANCE,
+        "working_distance_m": DISTANCE_TOLERANCE,
+    }.get(name, CONDITION_TOLERANCE)
     if name == "acceleration_voltage_v":
         # Some programs show the negative voltage of the cathode.
-        low, high, own_value = (*sorted((abs(low), abs(high))), abs(own_value))
+        low, high, number = (*sorted((abs(low), abs(high))), abs(number))
     least = height_sigma_m if name == "working_distance_m" else 0.0
-    return own_value < low - max(relative * abs(low), least) or own_value > high + max(
+    return number < low - max(relative * abs(low), least) or number > high + max(
         relative * abs(high), least
     )

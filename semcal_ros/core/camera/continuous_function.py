@@ -30,9 +30,6 @@ from numpy.polynomial import legendre
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["KINDS", "ContinuousFunction", "basis_row"]
-
-
 KINDS = ("chebyshev_log", "chebyshev", "legendre", "linear_log", "ode")
 
 
@@ -233,8 +230,8 @@ class ContinuousFunction:
         if len(self.extension):
             # Downwards, everything is mirrored.
             sign = 1.0 if self.extension[-1] > self.extension[0] else -1.0
-            bent = _extension_row(sign * float(np.log(g)), sign * np.log(self.extension))
-            row = np.concatenate([row, bent])
+            extension = _extension_row(sign * float(np.log(g)), sign * np.log(self.extension))
+            row = np.concatenate([row, extension])
         if len(self.breaks) == 0:
             return row
         return np.concatenate([row, (g >= self.breaks).astype(np.float64)])

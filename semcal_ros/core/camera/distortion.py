@@ -34,15 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
-
-__all__ = ["Undistortion", "distort_jacobians", "distort_normalised", "undistort_normalised"]
-
-
-# Newton's method converges quadratically from the closed inverse of the radial part; a point that
-# needs more steps lies at a fold of the map.
-_MAX_ITERATIONS = 50
-# Half an ulp of a coordinate of order one: Newton cannot do better in double precision.
-_TOLERANCE = 1e-14
+from semcal_ros.core.camera.thresholds import LENS_STEPS_MAX, LENS_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -170,21 +162,25 @@ def undistort_normalised(
     done = np.zeros(len(q), dtype=bool)
     iterations = 0
     active = np.flatnonzero(branch)
-    while active.size and iterations < _MAX_ITERATIONS:
+    while active.size and iterations < LENS_STEPS_MAX:
         iterations += 1
         f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s, xi_u)
-        miss = q_d[active] - f
+        residual = q_d[active] - f
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.
         good = np.isfinite(determinant) & (determinant > 0.0)
-        step = np.empty_like(miss)
+        step = np.empty_like(residual)
         safe = np.where(good, determinant, np.nan)
-        step[:, 0] = (jacobian[:, 1, 1] * miss[:, 0] - jacobian[:, 0, 1] * miss[:, 1]) / safe
-        step[:, 1] = (jacobian[:, 0, 0] * miss[:, 1] - jacobian[:, 1, 0] * miss[:, 0]) / safe
-        error[active] = np.hypot(miss[:, 0], miss[:, 1])
+        step[:, 0] = (
+            jacobian[:, 1, 1] * residual[:, 0] - jacobian[:, 0, 1] * residual[:, 1]
+        ) / safe
+        step[:, 1] = (
+            jacobian[:, 0, 0] * residual[:, 1] - jacobian[:, 1, 0] * residual[:, 0]
+        ) / safe
+        error[active] = np.hypot(residual[:, 0], residual[:, 1])
         q[active] = q[active] + step
         size = np.hypot(step[:, 0], step[:, 1])
-        reached = good & (size <= _TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
+        reached = good & (size <= LENS_TOLERANCE * (1.0 + np.hypot(q[active, 0], q[active, 1])))
         done[active[reached]] = True
         active = active[good & ~reached & np.isfinite(size)]
     # Rounding may keep the last step just above the tolerance; a point that maps back is converged.

@@ -26,8 +26,6 @@ import numpy as np
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Certificate", "FitRecord", "ScaleShares"]
-
 
 @dataclass(frozen=True)
 class Certificate:

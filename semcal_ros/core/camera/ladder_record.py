@@ -22,8 +22,6 @@ import numpy as np
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["LadderRecord", "Relay"]
-
 
 @dataclass(frozen=True)
 class Relay:

@@ -28,12 +28,8 @@ import numpy as np
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.thresholds import CONTRADICTION_SIGMAS
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = ["KnownPixelSize", "make_nominal_calibration"]
-
-# Two sizes for one magnification contradict beyond so many of their joint sigmas.
-_CONTRADICTION = 3.0
 
 
 @dataclass(frozen=True)
@@ -154,7 +150,7 @@ def _merge(sizes: Sequence[KnownPixelSize]) -> list[KnownPixelSize]:
 
 def _average(first: KnownPixelSize, second: KnownPixelSize) -> KnownPixelSize:
     joint = math.hypot(first.relative_sigma, second.relative_sigma)
-    if abs(math.log(second.pixel_size_m / first.pixel_size_m)) > _CONTRADICTION * joint:
+    if abs(math.log(second.pixel_size_m / first.pixel_size_m)) > CONTRADICTION_SIGMAS * joint:
         raise InvalidValueError(
             f"{second.where}{1e9 * second.pixel_size_m:g} and {1e9 * first.pixel_size_m:g} nm per px at "
             f"{first.magnification:g}x",

@@ -31,21 +31,16 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.thresholds import (
+    COEFFICIENT_POWERS,
+    COMPARED_ACROSS,
+    COMPARED_HEIGHTS,
+    FOCAL_LENGTH_MAX_PX,
+)
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = ["COEFFICIENTS", "PinholeModel", "fit_pinhole"]
 
 #: Names of the distortion coefficients, in the order of OpenCV.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-# Power of r that a coefficient multiplies.
-_POWERS = (2, 4, 1, 1, 6, 2, 4, 6)
-# Focal length that stands for a parallel projection, px: over a tenth of a field of 512 px in height, the scale changes
-# by 5e-6, a thousandth of a pixel at the edge.
-_LONGEST_PX = 1e7
-# Pixels across the field at which both models are compared; heights at which they are, in field widths.
-_ACROSS = 17
-_HEIGHTS = (-0.1, 0.0, 0.1)
-_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,11 +107,15 @@ def fit_pinhole(camera: ScanCamera, coefficients: int = 5) -> PinholeModel:
     if coefficients not in (4, 5, 8):
         raise InvalidValueError(f"{coefficients} distortion coefficients", expected="4, 5 or 8")
     points, raw = _sample(camera)
-    focal = camera.m / camera.rho if camera.rho * _LONGEST_PX > camera.m else _LONGEST_PX
+    focal = (
+        camera.m / camera.rho
+        if camera.rho * FOCAL_LENGTH_MAX_PX > camera.m
+        else FOCAL_LENGTH_MAX_PX
+    )
     distance_m = focal / camera.m
     # Coefficients in units in which the corner of the field is at r = 1, so that all unknowns matter alike.
     reach = 0.5 * np.hypot(camera.width, camera.height) / focal
-    by_power = reach ** -np.array(_POWERS[:coefficients], dtype=np.float64)
+    by_power = reach ** -np.array(COEFFICIENT_POWERS[:coefficients], dtype=np.float64)
     units = np.concatenate(
         [[focal, focal, 1.0, 1.0], by_power, [1.0 / focal] * 3, [1.0 / camera.m] * 2]
     )
@@ -152,12 +151,12 @@ def fit_pinhole(camera: ScanCamera, coefficients: int = 5) -> PinholeModel:
 
     def derivative(unknowns: Array) -> Array:
         made = build(unknowns)
-        own = cv2.projectPoints(
+        jacobian = cv2.projectPoints(
             points[:, None], made.rotation, made.translation_m, made.matrix, made.distortion
         )[1]
         # OpenCV: rotation, translation, focal lengths, principal point, distortion.
         columns = [6, 7, 8, 9, *range(10, 10 + coefficients), 0, 1, 2, 3, 4]
-        return np.concatenate([own[:, columns] * units, np.diag(ties)])
+        return np.concatenate([jacobian[:, columns] * units, np.diag(ties)])
 
     if _is_pinhole(camera):
         start[2:4] = camera.px, camera.py
@@ -180,14 +179,15 @@ def _is_pinhole(camera: ScanCamera) -> bool:
 
 def _sample(camera: ScanCamera) -> tuple[Array, Array]:
     """Return sem-frame points (n, 3), m, that fill the field at some heights, and their raw pixels (n, 2)."""
-    down = max(2, round(_ACROSS * camera.height / camera.width))
+    down = max(2, round(COMPARED_ACROSS * camera.height / camera.width))
     x, y = np.meshgrid(
-        np.linspace(0.0, camera.width - 1.0, _ACROSS), np.linspace(0.0, camera.height - 1.0, down)
+        np.linspace(0.0, camera.width - 1.0, COMPARED_ACROSS),
+        np.linspace(0.0, camera.height - 1.0, down),
     )
     flat = camera.undistort(np.stack([x.ravel(), y.ravel()], axis=1))
     flat = flat[np.all(np.isfinite(flat), axis=1)]
     field_m = camera.width / camera.m
-    heights = [h * field_m for h in _HEIGHTS if 1.0 + camera.rho * h * field_m > 0.1]
+    heights = [h * field_m for h in COMPARED_HEIGHTS if 1.0 + camera.rho * h * field_m > 0.1]
     points = np.concatenate([camera.sem_from_ideal(flat, h) for h in heights])
     raw = camera.project(points)
     known = np.all(np.isfinite(raw), axis=1)

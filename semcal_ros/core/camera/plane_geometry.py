@@ -28,19 +28,6 @@ from scipy.spatial.transform import Rotation
 
 from semcal_ros.core.arrays import Array
 
-__all__ = [
-    "AffineView",
-    "cross_matrices",
-    "cross_products",
-    "fit_homography",
-    "mirrored_tilt",
-    "normalising_similarity",
-    "rotation_from_affine",
-    "rotations_from_vectors",
-    "transform_points",
-    "view_affine",
-]
-
 
 def cross_matrices(vectors: Array) -> Array:
     """Return (n, 3, 3) matrices ``[v]`` such that ``[v] @ u`` is the cross product ``v x u``."""

@@ -24,11 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
-
-__all__ = ["PlumbBobCamera", "fit_plumb_bob"]
-
-# Points of the grid along each side: ten for each of the nine unknowns.
-_POINTS = 10
+from semcal_ros.core.camera.thresholds import PLUMB_BOB_POINTS
 
 
 @dataclass(frozen=True)
@@ -71,17 +67,20 @@ def fit_plumb_bob(camera: ScanCamera, width: int, height: int) -> PlumbBobCamera
     ``P`` is that of the rectified image. ``R`` turns the centre of the distortion onto the axis,
     where the model has it: a principal point is hardly seen at these focal lengths, and lies elsewhere.
     """
-    own = camera.resized(width, height)
-    if not own.rho > 0.0:
+    fitted = camera.resized(width, height)
+    if not fitted.rho > 0.0:
         return None
-    rect = own.rectified
+    rect = fitted.rectified
     f = float(rect.K[0, 0])
     if not np.isfinite(f):
         return None
     n = 0.5 * width
-    xs, ys = np.linspace(0.0, width - 1.0, _POINTS), np.linspace(0.0, height - 1.0, _POINTS)
+    xs, ys = (
+        np.linspace(0.0, width - 1.0, PLUMB_BOB_POINTS),
+        np.linspace(0.0, height - 1.0, PLUMB_BOB_POINTS),
+    )
     rect_px = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    raw_px = own.raw_from_rect(rect_px)
+    raw_px = fitted.raw_from_rect(rect_px)
     good = np.all(np.isfinite(raw_px), axis=1)
     rect_px, raw_px = rect_px[good], raw_px[good]
     centre = np.array([rect.ex, rect.ey])
@@ -89,7 +88,7 @@ def fit_plumb_bob(camera: ScanCamera, width: int, height: int) -> PlumbBobCamera
     # The rays of the raw camera, turned by R, are those of the rectified one. Half of the skew is a
     # turn about the axis.
     turn = Rotation.from_euler("xyz", [-np.arctan(offset[1]), np.arctan(offset[0]), 0.0])
-    turn = turn * Rotation.from_euler("z", 0.5 * own.skew)
+    turn = turn * Rotation.from_euler("z", 0.5 * fitted.skew)
     rays = np.column_stack([(rect_px - rect.K[:2, 2]) / f, np.ones(len(rect_px))])
     seen = turn.inv().apply(rays)
     # In half image widths, so that all unknowns are of order one.
@@ -101,7 +100,7 @@ def fit_plumb_bob(camera: ScanCamera, width: int, height: int) -> PlumbBobCamera
     def residuals(theta: Array) -> Array:
         return np.ravel(project(theta) - raw_px)
 
-    start = np.concatenate([[1.0, 1.0], own.raw_from_rect(centre[None])[0], np.zeros(5)])
+    start = np.concatenate([[1.0, 1.0], fitted.raw_from_rect(centre[None])[0], np.zeros(5)])
     if not np.all(np.isfinite(start)):
         return None
     theta = least_squares(residuals, start, x_scale="jac", ftol=1e-12, xtol=1e-12).x

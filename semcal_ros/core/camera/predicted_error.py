@@ -22,8 +22,6 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.projection import project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = ["make_field_lattice", "predict_aligned_sigma_px", "predict_shape_sigma_px"]
-
 
 def make_field_lattice(width: int, height: int, across: int) -> Array:
     """Make (n, 2) pixels on a regular lattice from edge to edge of the field, row by row."""

@@ -14,9 +14,8 @@
 
 """Projection of sem-frame points to raw pixels, with derivatives, for arrays of camera parameters.
 
-The model is that of design section 4, equations (9)-(12) of Malti et al. (2012),
-doi:10.1117/1.JEI.21.3.033020, rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho``
-so that nothing diverges at ``rho = 0``:
+The model is that of ``doc/model.md``: equations (9)-(12) of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020,
+rewritten with ``f = m / rho``, ``s = sigma f`` and ``d_0 = 1 / rho`` so that nothing diverges at ``rho = 0``:
 
     w   = 1 + rho Z
     x_u = px + m (a X + sigma Y) / w
@@ -41,17 +40,6 @@ from semcal_ros.core.camera.scan_distortion import (
     linearise_scan,
     raw_from_deflection,
 )
-
-__all__ = [
-    "ALL_NAMES",
-    "CAMERA_SIZES",
-    "PARAMETER_NAMES",
-    "ProjectionJacobians",
-    "project_ideal_points",
-    "project_points",
-    "project_points_with_jacobians",
-]
-
 
 PARAMETER_NAMES: tuple[str, ...] = (
     "m",
@@ -159,10 +147,10 @@ def project_points_with_jacobians(
     up, tilt = rho * inverse_w, z * inverse_w
     for row in (0, 1):
         by_x, by_y, by_xi = df_dq[:, row, 0], df_dq[:, row, 1], norm_px * df_dxi[:, row].T
-        own = 1.0
+        per_stretch = 1.0
         if scan is not None:
-            own = 1.0 / scan.stretch[row]
-            by_x, by_y, by_xi = own * by_x, own * by_y, own * by_xi
+            per_stretch = 1.0 / scan.stretch[row]
+            by_x, by_y, by_xi = per_stretch * by_x, per_stretch * by_y, per_stretch * by_xi
         along = by_x * scaled_u + by_y * scaled_v
         d_xyz[row, 0] = by_x * scale * a
         d_xyz[row, 1] = scale * (by_x * skew + by_y / a)
@@ -176,12 +164,12 @@ def project_points_with_jacobians(
         d_parameters[row, 6:8] = by_xi[:2]
         d_parameters[row, 8] = -by_x
         d_parameters[row, 9] = -by_y
-        d_parameters[row, 8 + row] += own
+        d_parameters[row, 8 + row] += per_stretch
         if count > CAMERA_SIZES[0]:
             d_parameters[row, 10:12] = by_xi[2:]
         if scan is not None:
             functions = slice(0, ALONG_COUNT) if row == 0 else slice(ALONG_COUNT, None)
-            d_parameters[row, 12:][functions] = -own * scan.basis[functions]
+            d_parameters[row, 12:][functions] = -per_stretch * scan.basis[functions]
     return ProjectionJacobians(
         xy,
         np.moveaxis(d_xyz, -1, 0),

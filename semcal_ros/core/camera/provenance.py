@@ -22,8 +22,6 @@ from dataclasses import dataclass, field
 from semcal_ros.core.camera.conditions import describe_condition
 from semcal_ros.core.wording import printable
 
-__all__ = ["NOT_RECORDED", "Provenance"]
-
 NOT_RECORDED = "not recorded"
 """What people read in the place of what is not known."""
 

@@ -15,7 +15,7 @@
 """Residual field: the distortion that the terms of lens and scan cannot describe.
 
 What they leave is a smooth displacement of the image. It is held by a
-tensor-product B-spline over the raw pixel and log g (design section 4): a raw pixel x would lie at
+tensor-product B-spline over the raw pixel and log g (``doc/model.md``, "Residual field"): a raw pixel x would lie at
 
     x + n G((x - c) / n, g)
 
@@ -38,40 +38,17 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices
 from semcal_ros.core.camera.scan_distortion import scan_functions
+from semcal_ros.core.camera.thresholds import (
+    FIELD_BREAKS_X,
+    FIELD_BREAKS_Y,
+    FIELD_DEGREE,
+    FIELD_STEPS_MAX,
+    FIELD_TOLERANCE,
+)
 from semcal_ros.core.errors import InvalidValueError
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
-
-__all__ = ["FieldSlice", "ResidualField", "zero_field"]
-
-
-# Cubic splines: the field has two continuous derivatives.
-_DEGREE = 3
-# Knots in half image widths; the outermost ones lie outside the image, so that its border is
-# inside the domain.
-_BREAKS_X = (
-    -1.04,
-    -1.0,
-    -0.97,
-    -0.935,
-    -0.9,
-    -0.8,
-    -0.65,
-    -0.45,
-    -0.22,
-    0.0,
-    0.25,
-    0.5,
-    0.75,
-    1.04,
-)
-# Knots in half image heights.
-_BREAKS_Y = (-1.04, -0.5, 0.0, 0.5, 1.04)
-# Newton's method needs a few steps; a point that needs more has no raw position.
-_MAX_STEPS = 20
-# Newton's error after a step of this size is below rounding.
-_TOLERANCE = 1e-9
 
 
 def _clamped(breaks: Array, degree: int) -> Array:
@@ -101,10 +78,10 @@ def _lattice_rows(values: bytes, knots: bytes, *, straight: bool = False) -> Arr
     Beyond the outermost knots the spline is constant, or straight.
     """
     at, ends = np.frombuffer(values), np.frombuffer(knots)[[0, -1]]
-    rows = _spline_rows(at, np.frombuffer(knots), _DEGREE)
+    rows = _spline_rows(at, np.frombuffer(knots), FIELD_DEGREE)
     if straight:
         inside = np.clip(at, *ends)
-        rows += (at - inside)[:, None] * _basis_functions(knots, _DEGREE)(inside, nu=1)
+        rows += (at - inside)[:, None] * _basis_functions(knots, FIELD_DEGREE)(inside, nu=1)
     return rows.astype(np.float32)
 
 
@@ -112,7 +89,7 @@ def _spline_slopes(values: Array, knots: Array) -> Array:
     """Return (n, size) derivatives of the basis functions, zero beyond the outermost knots."""
     inside = (values > knots[0]) & (values < knots[-1])
     at = np.clip(values, knots[0], knots[-1])
-    slopes = _basis_functions(knots.tobytes(), _DEGREE)(at, nu=1)
+    slopes = _basis_functions(knots.tobytes(), FIELD_DEGREE)(at, nu=1)
     return np.where(inside[:, None], slopes, 0.0)
 
 
@@ -157,13 +134,13 @@ class FieldSlice:
 
     def basis(self, q: Array) -> Array:
         """Return (n, ny nx) products of the basis functions at normalised raw positions (n, 2)."""
-        x = _spline_rows(q[:, 0], self.knots_x, _DEGREE)
-        y = _spline_rows(q[:, 1], self.knots_y, _DEGREE)
+        x = _spline_rows(q[:, 0], self.knots_x, FIELD_DEGREE)
+        y = _spline_rows(q[:, 1], self.knots_y, FIELD_DEGREE)
         return (y[:, :, None] * x[:, None, :]).reshape(len(q), -1)
 
     def basis_down(self, y: Array) -> Array:
         """Return (n, ny) basis functions down the image at normalised raw coordinates (n,)."""
-        return _spline_rows(y, self.knots_y, _DEGREE)
+        return _spline_rows(y, self.knots_y, FIELD_DEGREE)
 
     def displacement(self, q: Array) -> Array:
         """Return (n, 2) displacements at normalised raw positions (n, 2); NaN at NaN positions."""
@@ -173,8 +150,8 @@ class FieldSlice:
             out[known] = self.displacement(q[known])
             return out
         ny, nx, _ = self.coefficients.shape
-        x = _spline_rows(q[:, 0], self.knots_x, _DEGREE)
-        y = _spline_rows(q[:, 1], self.knots_y, _DEGREE)
+        x = _spline_rows(q[:, 0], self.knots_x, FIELD_DEGREE)
+        y = _spline_rows(q[:, 1], self.knots_y, FIELD_DEGREE)
         along = (y @ self.coefficients.reshape(ny, -1)).reshape(-1, nx, 2)
         return np.einsum("na,nac->nc", x, along)
 
@@ -197,7 +174,7 @@ class FieldSlice:
         """Return (n, 2, 2) derivatives of the displacement by position; finite positions only."""
         ny, nx, _ = self.coefficients.shape
         (x, dx), (y, dy) = (
-            (_spline_rows(v, knots, _DEGREE), _spline_slopes(v, knots))
+            (_spline_rows(v, knots, FIELD_DEGREE), _spline_slopes(v, knots))
             for v, knots in ((q[:, 0], self.knots_x), (q[:, 1], self.knots_y))
         )
         flat = self.coefficients.reshape(ny, -1)
@@ -212,14 +189,14 @@ class FieldSlice:
         """
         q = target - self.displacement(target)
         active = np.flatnonzero(np.all(np.isfinite(q), axis=1))
-        for _ in range(_MAX_STEPS):
+        for _ in range(FIELD_STEPS_MAX):
             if not active.size:
                 return q
             here = q[active]
-            miss = here + self.displacement(here) - target[active]
-            step = np.linalg.solve(np.eye(2) + self.gradient(here), miss[:, :, None])[:, :, 0]
+            residual = here + self.displacement(here) - target[active]
+            step = np.linalg.solve(np.eye(2) + self.gradient(here), residual[:, :, None])[:, :, 0]
             q[active] = here - step
-            active = active[np.max(np.abs(step), axis=1) > _TOLERANCE]
+            active = active[np.max(np.abs(step), axis=1) > FIELD_TOLERANCE]
         q[active] = np.nan
         return q
 
@@ -253,11 +230,11 @@ class ResidualField:
             )
         for knots in (self.knots_x, self.knots_y):
             rising = knots.ndim == 1 and np.all(np.isfinite(knots)) and np.all(np.diff(knots) >= 0)
-            if not (rising and len(knots) >= 2 * (_DEGREE + 1) and knots[0] < knots[-1]):
+            if not (rising and len(knots) >= 2 * (FIELD_DEGREE + 1) and knots[0] < knots[-1]):
                 raise InvalidValueError(
                     f"knots {knots.tolist()} of a residual field", expected="a rising sequence"
                 )
-        nx, ny = len(self.knots_x) - _DEGREE - 1, len(self.knots_y) - _DEGREE - 1
+        nx, ny = len(self.knots_x) - FIELD_DEGREE - 1, len(self.knots_y) - FIELD_DEGREE - 1
         shape = self.coefficients.shape
         if len(shape) != 4 or shape[0] < 1 or shape[1:] != (ny, nx, 2):
             raise InvalidValueError(
@@ -318,7 +295,10 @@ class ResidualField:
         """
         total = np.zeros(2)
         for axis, knots in ((1, self.knots_y), (2, self.knots_x)):
-            apart = np.maximum(knots[_DEGREE + 1 : -1] - knots[1 : -_DEGREE - 1], 1e-9) / _DEGREE
+            apart = (
+                np.maximum(knots[FIELD_DEGREE + 1 : -1] - knots[1 : -FIELD_DEGREE - 1], 1e-9)
+                / FIELD_DEGREE
+            )
             slopes = np.diff(self.coefficients, axis=axis).swapaxes(axis, 2)
             total += np.max(np.abs(slopes / apart[:, None]), axis=(0, 1, 2))
         return float(np.max(total))
@@ -369,7 +349,7 @@ def zero_field(
 ) -> ResidualField:
     """Make a field without displacement, with ``count`` coefficients in log g."""
     aspect = image_size[1] / image_size[0]
-    knots_x = _clamped(np.array(_BREAKS_X), _DEGREE)
-    knots_y = _clamped(aspect * np.array(_BREAKS_Y), _DEGREE)
-    shape = (count, len(knots_y) - _DEGREE - 1, len(knots_x) - _DEGREE - 1, 2)
+    knots_x = _clamped(np.array(FIELD_BREAKS_X), FIELD_DEGREE)
+    knots_y = _clamped(aspect * np.array(FIELD_BREAKS_Y), FIELD_DEGREE)
+    shape = (count, len(knots_y) - FIELD_DEGREE - 1, len(knots_x) - FIELD_DEGREE - 1, 2)
     return ResidualField(knots_x, knots_y, g_range, np.zeros(shape))

@@ -46,8 +46,6 @@ from semcal_ros.core.camera.scan_distortion import (
 )
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["RectifiedCamera", "ScanCamera", "as_points"]
-
 # Parameters that grow with the number of pixels of an image.
 _IN_PX = ("m", "px", "py", "ex", "ey")
 
@@ -72,7 +70,7 @@ def as_points(values: ArrayLike, dimensions: int) -> Array:
 
 @dataclass(frozen=True)
 class ScanCamera:
-    """Projection and distortion of the SEM at one magnification (design section 4).
+    """Projection and distortion of the SEM at one magnification: ``doc/model.md``.
 
     It knows three kinds of pixels of one image: *raw* ones, as scanned; *ideal* ones, without
     distortion; *rectified* ones, which are ideal, square and at right angles, as in ``image_rect``.
@@ -458,7 +456,7 @@ class ScanCamera:
         ex, ey = self.rect_from_ideal([[self.ex, self.ey]])[0].tolist()
         covariance = self.covariance
         if covariance is not None:
-            covariance = _congruent(self._rectified_from_own, covariance)
+            covariance = _congruent(self._rectified_from_parameters, covariance)
         return RectifiedCamera(
             magnification=self.magnification,
             m=self.m,
@@ -480,7 +478,7 @@ class ScanCamera:
         )
 
     @property
-    def _rectified_from_own(self) -> Array:
+    def _rectified_from_parameters(self) -> Array:
         """(P, P) from errors of the parameters to those of the parameters of :attr:`rectified`.
 
         The rectification is done with the parameters as they are estimated, so an error dM of the
@@ -676,7 +674,9 @@ class RectifiedCamera(ScanCamera):
         covariance = self.source.joint_covariance
         if covariance is None:
             return None
-        return _congruent(_extend(self.source._rectified_from_own, len(covariance)), covariance)
+        return _congruent(
+            _extend(self.source._rectified_from_parameters, len(covariance)), covariance
+        )
 
     def project_jacobian(self, xyz_m: ArrayLike) -> Array:
         """Return the derivative (n, 2, P + F) of the rectified pixel of a point.
@@ -691,8 +691,8 @@ class RectifiedCamera(ScanCamera):
         by = by * source._stretch(xy)[:, :, None]
         lens = distort_jacobians(q, *source._lens)[1]
         by = source._rect_from_ideal @ np.linalg.solve(lens, by)
-        own = by @ np.linalg.inv(_extend(source._rectified_from_own, by.shape[2]))
-        return _scatter_rows(own, known, len(points))
+        by_rectified = by @ np.linalg.inv(_extend(source._rectified_from_parameters, by.shape[2]))
+        return _scatter_rows(by_rectified, known, len(points))
 
 
 def _congruent(matrix: Array, covariance: Array) -> Array:

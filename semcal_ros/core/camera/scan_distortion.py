@@ -42,23 +42,15 @@ from functools import lru_cache
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.camera.thresholds import (
+    LEGENDRE_POWERS,
+    SCAN_END,
+    SCAN_LAST_STEP,
+    SCAN_SLOPE_MAX,
+    SCAN_STEPS_MAX,
+    SETTLING_TIMES,
+)
 
-__all__ = [
-    "ALONG_COUNT",
-    "SCAN_NAMES",
-    "SETTLING",
-    "SETTLING_TIMES",
-    "Raster",
-    "ScanDerivatives",
-    "deflection_shift",
-    "deflection_stretch",
-    "linearise_scan",
-    "raw_from_deflection",
-    "scan_functions",
-]
-
-SETTLING_TIMES: tuple[float, ...] = (0.0117, 0.0234, 0.0469, 0.0938, 0.1875)
-"""Time constants of the settling, in half lines: 3, 6, 12, 24 and 48 columns of 512."""
 SCAN_NAMES: tuple[str, ...] = (
     "coil_x2",
     "coil_x3",
@@ -77,15 +69,8 @@ SCAN_NAMES: tuple[str, ...] = (
 """Amplitudes in half image widths: of the functions along the lines, then of those across them."""
 SETTLING = slice(4, 9)
 """Which of these are the settling."""
-ALONG_COUNT = 9
+ALONG_COUNT: int = SETTLING.stop
 """How many of them are along the lines."""
-# Beyond the picture the functions go on as straight lines.
-_END = 1.0
-# Newton's method converges quadratically; a function as steep as it may be takes five steps. A last step as long as
-# this leaves 1e-9 px where the settling is the quickest and as steep as it may be, and much less elsewhere.
-_MAX_STEPS = 30
-_LAST_STEP = 1e-7
-_LARGEST_SLOPE = 0.9
 
 
 @dataclass(frozen=True)
@@ -139,15 +124,6 @@ def _line_of_decay(time: float) -> tuple[float, float]:
 
 _LINES = np.array([_line_of_decay(time) for time in SETTLING_TIMES])
 _RATES = -1.0 / np.array(SETTLING_TIMES)
-# Coefficients of the powers of u in P2 to P5.
-_POWERS = np.array(
-    [
-        [-0.5, 0.0, 1.5, 0.0, 0.0, 0.0],
-        [0.0, -1.5, 0.0, 2.5, 0.0, 0.0],
-        [0.375, 0.0, -3.75, 0.0, 4.375, 0.0],
-        [0.0, 1.875, 0.0, -8.75, 0.0, 7.875],
-    ]
-)
 
 
 def _decays(u: Array) -> tuple[Array, Array]:
@@ -162,9 +138,12 @@ def _decays(u: Array) -> tuple[Array, Array]:
 
 def _functions(u: Array, axis: int) -> tuple[Array, Array]:
     """Return the functions of an axis, (k, n), and their slopes; straight lines beyond the picture."""
-    inside = np.clip(u, -_END, _END)
+    inside = np.clip(u, -SCAN_END, SCAN_END)
     powers = np.stack([np.ones_like(inside), *np.cumprod(np.stack([inside] * 5), axis=0)])
-    values, slopes = _POWERS @ powers, (_POWERS[:, 1:] * np.arange(1.0, 6.0)) @ powers[:-1]
+    values, slopes = (
+        LEGENDRE_POWERS @ powers,
+        (LEGENDRE_POWERS[:, 1:] * np.arange(1.0, 6.0)) @ powers[:-1],
+    )
     if axis == 0:
         decays, decay_slopes = _decays(inside)
         values, slopes = np.concatenate([values, decays]), np.concatenate([slopes, decay_slopes])
@@ -182,18 +161,18 @@ def _scale(raster: Raster, axis: int) -> float:
 
 def _amplitudes(amplitudes: Array, axis: int) -> Array:
     """Return those of an axis, (k, 1) or (k, n)."""
-    own = amplitudes[..., :ALONG_COUNT] if axis == 0 else amplitudes[..., ALONG_COUNT:]
-    return np.moveaxis(np.atleast_2d(own), -1, 0)
+    of_axis = amplitudes[..., :ALONG_COUNT] if axis == 0 else amplitudes[..., ALONG_COUNT:]
+    return np.moveaxis(np.atleast_2d(of_axis), -1, 0)
 
 
 def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (13,) or (n, 13)."""
     out = np.zeros_like(xy)
     for axis in (0, 1):
-        own = _amplitudes(amplitudes, axis)
-        if np.any(own):
+        of_axis = _amplitudes(amplitudes, axis)
+        if np.any(of_axis):
             u = (xy[:, axis] - raster.middle_px[axis]) / _scale(raster, axis)
-            out[:, axis] = raster.norm_px * _make_curve(own).value(u)[0]
+            out[:, axis] = raster.norm_px * _make_curve(of_axis).value(u)[0]
     return out
 
 
@@ -212,26 +191,26 @@ def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) ->
     """
     raw = deflection.copy()
     for axis in (0, 1):
-        own = _amplitudes(amplitudes, axis)
-        if np.any(own):
-            raw[:, axis] = _invert(deflection[:, axis], own, raster, axis)
+        of_axis = _amplitudes(amplitudes, axis)
+        if np.any(of_axis):
+            raw[:, axis] = _invert(deflection[:, axis], of_axis, raster, axis)
     return raw
 
 
-def _invert(target: Array, own: Array, raster: Raster, axis: int) -> Array:
+def _invert(target: Array, of_axis: Array, raster: Raster, axis: int) -> Array:
     scale = _scale(raster, axis)
-    curve = _make_curve(own)
+    curve = _make_curve(of_axis)
     # In half pictures of this axis.
     goal, part = (target - raster.middle_px[axis]) / scale, raster.norm_px / scale
     u = goal - part * curve.value(goal)[0]
-    for _ in range(_MAX_STEPS):
+    for _ in range(SCAN_STEPS_MAX):
         value, slope = curve.value(u)
         stretch = 1.0 + part * slope
         change = (u + part * value - goal) / np.where(
-            stretch > 1.0 - _LARGEST_SLOPE, stretch, np.nan
+            stretch > 1.0 - SCAN_SLOPE_MAX, stretch, np.nan
         )
         u = u - change
-        late = np.abs(change) > _LAST_STEP
+        late = np.abs(change) > SCAN_LAST_STEP
         if not np.any(late):
             return raster.middle_px[axis] + scale * u
     return np.where(late, np.nan, raster.middle_px[axis] + scale * u)
@@ -254,7 +233,7 @@ class _Curve:
 
     def value(self, u: Array) -> tuple[Array, Array]:
         """Return the value and the slope at ``u`` (n,); a straight line beyond the picture."""
-        inside = np.clip(u, -_END, _END)
+        inside = np.clip(u, -SCAN_END, SCAN_END)
         value, slope = self.powers[5] * np.ones_like(u), np.zeros_like(u)
         for power in self.powers[4::-1]:
             slope *= inside
@@ -268,22 +247,22 @@ class _Curve:
         return value + slope * (u - inside), slope
 
 
-def _make_curve(own: Array) -> _Curve:
+def _make_curve(of_axis: Array) -> _Curve:
     """Return the sum of the functions of an axis with amplitudes (k, 1), or with some for each point, (k, n)."""
-    return _kept_curve(own.tobytes()) if own.shape[1] == 1 else _sum_functions(own)
+    return _kept_curve(of_axis.tobytes()) if of_axis.shape[1] == 1 else _sum_functions(of_axis)
 
 
 @lru_cache(maxsize=64)
-def _kept_curve(own: bytes) -> _Curve:
+def _kept_curve(of_axis: bytes) -> _Curve:
     # A live camera asks for the same ones several times a frame.
-    return _sum_functions(np.frombuffer(own)[:, None])
+    return _sum_functions(np.frombuffer(of_axis)[:, None])
 
 
-def _sum_functions(own: Array) -> _Curve:
-    polynomials = len(_POWERS)
-    powers = np.tensordot(_POWERS, own[:polynomials], axes=(0, 0))
+def _sum_functions(of_axis: Array) -> _Curve:
+    polynomials = len(LEGENDRE_POWERS)
+    powers = np.tensordot(LEGENDRE_POWERS, of_axis[:polynomials], axes=(0, 0))
     decays = []
-    for amplitude, line, rate in zip(own[polynomials:], _LINES, _RATES, strict=False):
+    for amplitude, line, rate in zip(of_axis[polynomials:], _LINES, _RATES, strict=False):
         if np.any(amplitude):
             powers[0] -= amplitude * line[0]
             powers[1] -= amplitude * line[1]

@@ -20,10 +20,10 @@ pass ``k`` is acquired at
 
     t = t0 + k T + row T / rows + (col / width) (T / rows) (1 - f)
 
-(design section 7). A frame averaged from several passes shows the mean over the passes. Where each line is scanned
-n times before the next one, its time ``T / rows`` is that of n lines, and the pixel shows their mean.
-A recursive average ``y_k = y_(k-1) + (x_k - y_(k-1)) / N`` of passes x shows what was N - 1 passes ago
-on average.
+as ``doc/drift_and_rectification.md``, "Raster timing", says. A frame averaged from several passes shows the mean over
+the passes. Where each line is scanned n times before the next one, its time ``T / rows`` is that of n lines, and the
+pixel shows their mean. A recursive average ``y_k = y_(k-1) + (x_k - y_(k-1)) / N`` of passes x shows what was N - 1
+passes ago on average.
 """
 
 from __future__ import annotations
@@ -34,13 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array, check_positive
+from semcal_ros.core.camera.thresholds import FRAME_TIME_MAX_S
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = ["ScanTiming"]
-
-
-# Eleven days: what is longer has lost its unit.
-_LONGEST_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -72,10 +67,10 @@ class ScanTiming:
 
     def __post_init__(self) -> None:
         check_positive(self.frame_time_s, "frame time", "s")
-        if self.frame_time_s > _LONGEST_S:
+        if self.frame_time_s > FRAME_TIME_MAX_S:
             raise InvalidValueError(
                 f"frame time {self.frame_time_s:g} s",
-                expected=f"at most {_LONGEST_S:g} s",
+                expected=f"at most {FRAME_TIME_MAX_S:g} s",
                 do="state the unit, as in --frame-time 500ms",
             )
         if self.averages < 1:

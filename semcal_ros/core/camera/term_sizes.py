@@ -29,16 +29,7 @@ from semcal_ros.core.camera.scan_distortion import (
     SETTLING,
     deflection_shift,
 )
-
-__all__ = [
-    "TERM_KINDS",
-    "describe_term_sizes",
-    "displace_by",
-    "has_terms",
-    "largest_term_sizes",
-    "measure_along_axes",
-    "measure_terms",
-]
+from semcal_ros.core.camera.thresholds import TERM_SIZES_ACROSS
 
 TERM_KINDS: tuple[str, ...] = (
     "radial",
@@ -49,8 +40,6 @@ TERM_KINDS: tuple[str, ...] = (
     "residual field",
 )
 """The kinds of distortion: of the lens, of the scan, and what both leave."""
-# Points of the lattice along each side of the picture, its outermost pixels among them.
-_ACROSS = 33
 
 
 def has_terms(camera: ScanCamera) -> bool:
@@ -112,7 +101,7 @@ def measure_along_axes(camera: ScanCamera, kind: str) -> tuple[float, float]:
 
 
 def _displace_lattice(camera: ScanCamera, kind: str) -> Array:
-    x, y = (np.linspace(0.0, n - 1.0, _ACROSS) for n in (camera.width, camera.height))
+    x, y = (np.linspace(0.0, n - 1.0, TERM_SIZES_ACROSS) for n in (camera.width, camera.height))
     return displace_by(camera, kind, np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1))
 
 

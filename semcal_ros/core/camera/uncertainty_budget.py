@@ -28,23 +28,13 @@ import numpy as np
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import RectifiedCamera
+from semcal_ros.core.camera.thresholds import (
+    COVERAGE_FACTOR,
+    JUDGED_MAGNIFICATIONS,
+    LENGTH_PLACES,
+    SPECIMEN_TILT_SIGMA_RAD,
+)
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = [
-    "BudgetPart",
-    "UncertaintyBudget",
-    "budget_of_length",
-    "budget_of_pixel_size",
-    "worst_pixel_size",
-]
-
-#: Tilt of a specimen that is mounted flat, 1-sigma: half a degree, as in the priors of a calibration.
-_TILT_SIGMA_RAD = 0.0087
-_COVERAGE = 2.0
-# Magnifications at which the range is judged: four per factor of two over two decades.
-_JUDGED = 25
-# Where a length may lie in the image, as a part of width and height: the worst of these places counts.
-_PLACES = (0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True)
@@ -91,12 +81,12 @@ class UncertaintyBudget:
     @property
     def coverage(self) -> float:
         """Coverage factor k of :attr:`expanded_m`."""
-        return _COVERAGE
+        return COVERAGE_FACTOR
 
     @property
     def expanded_m(self) -> float:
         """Expanded uncertainty, m."""
-        return _COVERAGE * self.sigma_m
+        return COVERAGE_FACTOR * self.sigma_m
 
     def share(self, part: BudgetPart) -> float:
         """Part of the combined variance, 0 to 1."""
@@ -122,10 +112,10 @@ def _scale_parts(
             expected=f"one below the pivot of the scan at {-1e3 / camera.rho:.3g} mm",
         )
     rectified, sigma = camera.rectified, model.scale_sigma
-    own = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]
+    total = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]
     extra = float(np.hypot(sigma.relative(camera.rho), model.ladder_sigma(magnification)))
     beyond = model.extrapolation_sigma(magnification)
-    views = max(own**2 - extra**2 - beyond**2, 0.0)
+    views = max(total**2 - extra**2 - beyond**2, 0.0)
     steps = 0.0
     if (ladder := model.ladder) is not None and ladder.beyond(magnification) > 0.0:
         # What is not known at the end of the grid goes with every step; the rest comes from the steps.
@@ -144,7 +134,7 @@ def _scale_parts(
         "place of a relay": 0.0 if ladder is None else ladder.relay_sigma(magnification),
         **_split_views(model, magnification, views),
         # The cosine of a small tilt differs from 1 by half of its square, of which this is the RMS.
-        "tilt of the specimen": 0.5 * math.sqrt(3.0) * _TILT_SIGMA_RAD**2,
+        "tilt of the specimen": 0.5 * math.sqrt(3.0) * SPECIMEN_TILT_SIGMA_RAD**2,
     }
     if height_m:
         rho_sigma = math.sqrt(max(float(camera.covariance[5, 5]), 0.0))
@@ -175,7 +165,7 @@ def worst_pixel_size(model: CalibrationModel) -> tuple[float, float]:
     """Largest relative 1-sigma of nm per pixel in the calibrated range, of the worse axis, and its magnification."""
     low, high = model.magnification_range
     # The ends of the range come out of the logarithm with a rounding error.
-    judged = np.clip(np.geomspace(low, high, _JUDGED), low, high)
+    judged = np.clip(np.geomspace(low, high, JUDGED_MAGNIFICATIONS), low, high)
     cameras = [model.at(float(g)) for g in judged]
     sigmas = [
         max(s / x for s, x in zip(c.pixel_size_sigma_m, c.pixel_size_m, strict=True))
@@ -254,9 +244,9 @@ def _distortion(camera: RectifiedCamera, length_px: float) -> float:
     for axis, full in ((0, camera.width), (1, camera.height)):
         step = np.zeros(2)
         step[axis] = 0.5 * min(length_px, full - 1.0)
-        own = camera.pixel_size_sigma_m[axis] / camera.pixel_size_m[axis]
-        for x in _PLACES:
-            for y in _PLACES:
+        relative = camera.pixel_size_sigma_m[axis] / camera.pixel_size_m[axis]
+        for x in LENGTH_PLACES:
+            for y in LENGTH_PLACES:
                 middle = np.array([x * camera.width, y * camera.height])
                 # A length that does not fit there is moved to where it does.
                 room = (camera.width, camera.height)
@@ -266,5 +256,5 @@ def _distortion(camera: RectifiedCamera, length_px: float) -> float:
                 row = (jacobian[1] - jacobian[0]) / (2.0 * step[axis])
                 total = float(row @ covariance @ row)
                 if math.isfinite(total):
-                    worst = max(worst, total - own**2)
+                    worst = max(worst, total - relative**2)
     return math.sqrt(worst)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Automatic detection of endless grids: chess boards, dots, holes and crossed lines."""
+"""Automatic detection of endless grids: checkerboards, dots, holes and crossed lines."""
 
 from __future__ import annotations
 

@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Least-squares fit of the edge model to the pixels around each corner, with its covariance."""
+"""Least-squares fit of the edge model to the pixels around each corner, with its covariance.
+
+A test of the fit: opposite squares of a corner have the same grey value, as on a checkerboard.
+"""
 
 from __future__ import annotations
 
@@ -34,43 +37,19 @@ from semcal_ros.core.corners.edge_model import (
     evaluate,
 )
 from semcal_ros.core.corners.priors import Prior
-from semcal_ros.core.corners.symmetry_test import compare_opposite_squares
+from semcal_ros.core.corners.thresholds import (
+    ASSUMED_VARIANCE,
+    BAND_BLURS,
+    BAND_MIN_PX,
+    BLUR_MIN_PX,
+    FIT_BLOCK_PIXELS,
+    NOISE_FLOOR_PART,
+    PULL_LEAST,
+)
 from semcal_ros.core.corners.window import PixelWindows
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-__all__ = [
-    "CornerFit",
-    "NoiseModel",
-    "PositionFit",
-    "band_px",
-    "fit_corners",
-    "fit_noise",
-    "normal_equations",
-    "rough_start",
-    "split_statistics",
-]
-
-
-# A pixel averages over its own width, which alone is a blur of 1 / sqrt(12) = 0.289 px: no edge is
-# sharper.
-BLUR_MIN_PX = 0.28
-# Least half-width of the band along an edge, which leaves room for an error of the prediction.
-BAND_MIN_PX = 3.0
-# Half-width of the band in blur widths: at three of them the slope of an edge is 1 % of its peak.
-BAND_BLURS = 3.0
-# The line of the noise model falls below zero for dark pixels; this part of the floor keeps their
-# weights within a factor of four of those at the mean of the dark pixels. A safeguard, not a
-# measurement.
-LEAST_OF_FLOOR = 0.25
-# Large enough to hide the cost of a call, small enough to keep the arrays in the cache.
-BLOCK_PIXELS = 24000
-# Part of the prior's variance: where pixels carry almost no information, rounding must not decide
-# whether a pull is large.
-PULL_LEAST = 0.02
-# Variance of a pixel in the first pass, before the noise is known.
-ASSUMED_VARIANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -89,7 +68,7 @@ class NoiseModel:
         """Return the variance at the grey values ``value``, in the same shape."""
         variance = np.float32(self.slope) * (value - np.float32(self.dark))
         variance += np.float32(self.floor)
-        least = np.float32(LEAST_OF_FLOOR * self.floor)
+        least = np.float32(NOISE_FLOOR_PART * self.floor)
         return np.asarray(np.maximum(variance, least), dtype=np.float32)
 
 
@@ -234,7 +213,7 @@ def fit_corners(
     judged
         Whether to compare opposite squares.
     """
-    block = max(1, BLOCK_PIXELS // windows.x.shape[1])
+    block = max(1, FIT_BLOCK_PIXELS // windows.x.shape[1])
     parts = []
     for first in range(0, max(1, len(windows.origin)), block):
         rows = slice(first, first + block)
@@ -388,3 +367,55 @@ def _solve_linear(
     np.einsum("nii->ni", normal)[...] += known
     right += known * prior.mean[:, NONLINEAR:]
     return np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
+
+
+def compare_opposite_squares(
+    windows: PixelWindows,
+    nonlinear: Array,
+    jacobian: Array32,
+    residual: Array32,
+    weight: Array32,
+    normal: Array,
+    step: Array,
+) -> tuple[Array, Array]:
+    """Apply a score test of two steps that the model lacks: both squares beyond an edge brighter.
+
+    Nothing is fitted again: the residuals are projected on the two new terms, from which the
+    parameters of the model are eliminated.
+
+    Parameters
+    ----------
+    windows, nonlinear
+        Pixels of n corners and (n, 7) parameters of :mod:`semcal_ros.core.corners.edge_model`.
+    jacobian, residual, weight
+        (n, 15, p) derivatives, (n, p) residuals and weights of the pixels before the last step.
+    normal, step
+        (n, 15, 15) normal matrices and (n, 15) last step.
+
+    Returns
+    -------
+    statistic
+        (n,) chi-square with two degrees of freedom where opposite squares are alike.
+    difference
+        (n,) the larger of the two steps, half the difference of grey value.
+    """
+
+    def column(values: Array) -> Array32:
+        return np.asarray(values, dtype=np.float32)[:, None]
+
+    px, py, angle_1, angle_2 = nonlinear.T[:4]
+    x, y = windows.x - column(px), windows.y - column(py)
+    side_1 = np.copysign(weight, column(np.cos(angle_1)) * y - column(np.sin(angle_1)) * x)
+    side_2 = np.copysign(weight, column(np.sin(angle_2)) * x - column(np.cos(angle_2)) * y)
+    sides = np.stack([side_1, side_2], axis=1)
+    shared = (sides @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+    score = (sides @ residual[:, :, None])[:, :, 0] - np.einsum("nka,na->nk", shared, step)
+    total = weight.sum(axis=1, dtype=np.float64)
+    information = np.empty((len(x), 2, 2))
+    # The ridge is for windows that show only one side of an edge.
+    information[:, 0, 0] = information[:, 1, 1] = total * (1.0 + 1e-6)
+    both = np.einsum("np,np->n", side_1, np.copysign(np.float32(1.0), side_2))
+    information[:, 0, 1] = information[:, 1, 0] = both
+    information -= shared @ np.linalg.solve(normal, shared.transpose(0, 2, 1))
+    size = np.linalg.solve(information, score[:, :, None])[:, :, 0]
+    return np.einsum("nk,nk->n", score, size), np.abs(size).max(axis=1)

@@ -30,36 +30,25 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.local_phase import follow_phase
-from semcal_ros.core.corners.spectrum import (
-    LEAST_PERIOD_PX,
-    LEAST_PERIODS,
-    Spectrum,
-    clip_levels,
-    compute_spectrum,
-    list_octaves,
+from semcal_ros.core.corners.spectrum import Spectrum, clip_levels, compute_spectrum, list_octaves
+from semcal_ros.core.corners.thresholds import (
+    BASES_TRIED,
+    BASIS_PARTS,
+    BASIS_RATIO_MAX,
+    BASIS_SINE_MIN,
+    CLEAR_POWER,
+    EXPLAINED_MIN,
+    FOLLOWED_AMONG,
+    FREQUENCIES_MAX,
+    FREQUENCY_OFF_BINS,
+    FREQUENCY_UNSURE_PART,
+    NEWTON_STEPS,
+    PERIOD_MIN_PX,
+    PERIODS_MIN,
 )
 
-__all__ = ["find_cells"]
-
-# Power over what is usual, from which a frequency counts: that of noise has an exponential distribution, of which a
-# quarter is below 0.29 means, and exceeds this once in 10^12 values.
-_CLEAR = 100.0
-# Frequencies that are looked at; the lowest of their parts, sums and differences, of which two are tried as a basis;
-# and the least parts of them: of thin lines any harmonics may be the strong ones.
-_MOST, _TRIED, _PARTS = 24, 48, 3
-# A basis: the sine of the angle between its frequencies, and the ratio of their lengths; a tilt of 55 degrees makes a
-# square 1.75 times as long as wide, and seen along the diagonal its angle 60 degrees.
-_LEAST_SINE, _LONGEST = 0.7, 1.9
-# How far frequencies may be from those of the basis, in bins, and as a part of them where a distortion bends lines.
-_OFF, _UNSURE = 1.0, 0.02
-# Part of the frequencies, by the roots of their clearness, that the basis has to explain: a foreign one is debris.
-_EXPLAINED = 0.95
 # The image with all grey levels, and with clipped ones, in which a hole weighs no more than the lines.
 _PREPARED: tuple[Callable[[Array32], Array32], ...] = (np.asarray, clip_levels)
-# Of so many of the clearest frequencies, the lowest are followed: distortions and waves change their phases least.
-_CLEAREST = 8
-# Newton steps from an even lattice.
-_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -92,8 +81,8 @@ def find_cells(level: Callable[[int], Array32], size: tuple[int, int]) -> Lattic
         if basis is None:
             continue
         for prepare, clearness in zip(_PREPARED, frequencies.clearness, strict=True):
-            clear = np.argsort(-clearness, kind="stable")[:_CLEAREST]
-            clear = clear[clearness[clear] > _CLEAR]
+            clear = np.argsort(-clearness, kind="stable")[:FOLLOWED_AMONG]
+            clear = clear[clearness[clear] > CLEAR_POWER]
             cells = _follow(level, prepare, octave, basis, frequencies.values, clear)
             if cells is not None:
                 return cells
@@ -114,9 +103,9 @@ def _list_frequencies(spectra: list[Spectrum]) -> _Frequencies:
     found = []
     for spectrum in spectra:
         radius = np.hypot(spectrum.fx, spectrum.fy)
-        among = radius > LEAST_PERIODS / size.min()
-        among &= (radius < 1.0 / LEAST_PERIOD_PX) & (spectrum.clearness > _CLEAR)
-        found.append(spectrum.find_frequencies(among, _MOST))
+        among = radius > PERIODS_MIN / size.min()
+        among &= (radius < 1.0 / PERIOD_MIN_PX) & (spectrum.clearness > CLEAR_POWER)
+        found.append(spectrum.find_frequencies(among, FREQUENCIES_MAX))
     values = np.concatenate(found)
     clearness = np.array([[_clearness_at(s, f) for f in values] for s in spectra])
     order = np.argsort(-clearness.max(axis=0), kind="stable") if len(values) else np.arange(0)
@@ -125,17 +114,17 @@ def _list_frequencies(spectra: list[Spectrum]) -> _Frequencies:
 
 
 def _clearness_at(spectrum: Spectrum, frequency: Array) -> float:
-    near = spectrum.bins_from(frequency) < 2.0 * _OFF
+    near = spectrum.bins_from(frequency) < 2.0 * FREQUENCY_OFF_BINS
     return float(spectrum.clearness[near].max(initial=0.0))
 
 
 def _find_distinct(frequencies: Array, size: Array, most: int) -> list[int]:
     """Return which (n, 2) frequencies are not near one before, or its opposite; at most so many."""
     kept: list[int] = []
-    for k, own in enumerate(frequencies):
+    for k, frequency in enumerate(frequencies):
         others = frequencies[kept]
-        near = np.minimum(_bins(own - others, size), _bins(own + others, size))
-        if near.min(initial=np.inf) > 2.0 * _OFF:
+        near = np.minimum(_bins(frequency - others, size), _bins(frequency + others, size))
+        if near.min(initial=np.inf) > 2.0 * FREQUENCY_OFF_BINS:
             kept.append(k)
         if len(kept) == most:
             break
@@ -149,25 +138,25 @@ def _find_basis(frequencies: _Frequencies, size: Array) -> _Basis | None:
         return None
     roots = np.sqrt(frequencies.clearness.max(axis=0))
     pairs = [a + sign * b for a, b in combinations(values, 2) for sign in (1.0, -1.0)]
-    parts = [values / n for n in range(1, _PARTS + 1)]
+    parts = [values / n for n in range(1, BASIS_PARTS + 1)]
     tried = np.concatenate([*parts, np.array(pairs)])
     length = np.linalg.norm(tried, axis=1)
     order = np.argsort(length, kind="stable")
-    tried = tried[order[length[order] > LEAST_PERIODS / size.min()]]
+    tried = tried[order[length[order] > PERIODS_MIN / size.min()]]
     best: _Basis | None = None
     largest = 0.0
-    for a, b in combinations(tried[_find_distinct(tried, size, _TRIED)], 2):
+    for a, b in combinations(tried[_find_distinct(tried, size, BASES_TRIED)], 2):
         area = abs(float(a[0] * b[1] - a[1] * b[0]))
         shorter, longer = sorted((float(np.linalg.norm(a)), float(np.linalg.norm(b))))
-        acute = area < _LEAST_SINE * shorter * longer
-        if acute or longer > _LONGEST * shorter or area <= 1.02 * largest:
+        acute = area < BASIS_SINE_MIN * shorter * longer
+        if acute or longer > BASIS_RATIO_MAX * shorter or area <= 1.02 * largest:
             continue
         basis = np.stack([a, b])
         multiples = np.rint(values @ np.linalg.inv(basis))
         off = _bins(values - multiples @ basis, size)
         orders = np.maximum(1.0, np.abs(multiples).sum(axis=1))
-        fits = off < _OFF * orders + _UNSURE * _bins(values, size)
-        if roots[fits].sum() < _EXPLAINED * roots.sum():
+        fits = off < FREQUENCY_OFF_BINS * orders + FREQUENCY_UNSURE_PART * _bins(values, size)
+        if roots[fits].sum() < EXPLAINED_MIN * roots.sum():
             continue
         if np.linalg.matrix_rank(multiples[fits]) == 2:
             refined = np.linalg.lstsq(multiples[fits], values[fits], rcond=None)[0]
@@ -180,10 +169,10 @@ def _reduce(basis: _Basis) -> _Basis:
     """Return the shortest basis of the same frequencies (Gauss)."""
     change = np.eye(2, dtype=np.intp)
     while True:
-        own = change @ basis.frequencies
-        if own[0] @ own[0] > own[1] @ own[1]:
-            change, own = change[::-1], own[::-1]
-        times = int(np.rint(own[0] @ own[1] / (own[0] @ own[0])))
+        shorter = change @ basis.frequencies
+        if shorter[0] @ shorter[0] > shorter[1] @ shorter[1]:
+            change, shorter = change[::-1], shorter[::-1]
+        times = int(np.rint(shorter[0] @ shorter[1] / (shorter[0] @ shorter[0])))
         if times == 0:
             break
         change = np.stack([change[0], change[1] - times * change[0]])
@@ -213,7 +202,7 @@ def _follow(
         return None
     highest = float(np.linalg.norm(frequencies[pair], axis=1).max())
     # The coarsest scale that resolves both is as good as any for the phases, and costs least.
-    further = max(0, int(np.log2(1.0 / highest / (1.6 * LEAST_PERIOD_PX))))
+    further = max(0, int(np.log2(1.0 / highest / (1.6 * PERIOD_MIN_PX))))
     image = prepare(level(octave + further))
     scale = 2.0**further
     period = 1.0 / float(np.linalg.norm(scale * basis.frequencies, axis=1).min())
@@ -237,7 +226,7 @@ def _follow(
     around = np.all((xy > -0.2 * middle) & (xy < 2.2 * middle), axis=1)
     ij, xy = ij[around], xy[around]
     start = np.rint(cell_of(middle[None]))
-    for _ in range(_STEPS):
+    for _ in range(NEWTON_STEPS):
         xy = xy - np.clip(cell_of(xy) - start - ij, -2.0, 2.0) @ axes
     inside: Mask = np.all((xy >= 0.0) & (xy <= [width - 1, height - 1]), axis=1)
     inside &= np.all(np.abs(cell_of(xy) - start - ij) < 0.1, axis=1)

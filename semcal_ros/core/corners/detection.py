@@ -14,8 +14,8 @@
 
 """The grid finder: lattices at all scales, the pattern of their cells, sub-pixel fit, rejection.
 
-Smoothed to its spacing, every grid on a square lattice is the chess board that its strongest
-harmonics make: a chess board itself, or dots, crosses and crossed lines, whose saddle points lie
+Smoothed to its spacing, every grid on a square lattice is the checkerboard that its strongest
+harmonics make: a checkerboard itself, or dots, crosses and crossed lines, whose saddle points lie
 between them. So one search grows lattices of saddle points at all scales; the unit cell of each, made
 of its bright squares, says which pattern it is; and what is most likely is fitted at sub-pixel
 accuracy.
@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from semcal_ros.core.arrays import Array, Image, Indices
+from semcal_ros.core.corners.checks import estimate_scatter_px
 from semcal_ros.core.corners.crossed_waves import find_cells
 from semcal_ros.core.corners.dots_and_lines import (
     bright_cells,
@@ -45,7 +46,6 @@ from semcal_ros.core.corners.grating import find_lines, fit_lines
 from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import estimate_scatter_px
 from semcal_ros.core.corners.pattern import (
     PATTERN_NAMES,
     CellShape,
@@ -56,55 +56,32 @@ from semcal_ros.core.corners.pattern import (
     describe_odds,
 )
 from semcal_ros.core.corners.saddle import LatticeStatus, prepare_image, screen_image
+from semcal_ros.core.corners.thresholds import (
+    ALONG_SIGMA,
+    CELL_ASYMMETRY_MAX,
+    CELL_FULL_PX,
+    CELL_MISFIT_MAX,
+    CHESS_MISFIT_MAX,
+    CLEAR_MISFIT,
+    COMMON_POWER_MIN,
+    CONVINCING_PART,
+    COVERED_RATIO,
+    FILLED_PART,
+    FOREIGN_MAX,
+    GROWN_MIN,
+    LATTICES_TRIED,
+    MINIMUM_CORNERS,
+    SAME_AREA_LOG,
+    SCALE_MAX_PART,
+    SCALES_PX,
+    SMALL_PART,
+    SPACING_MIN_PX,
+    UNEVEN_MAX,
+)
 from semcal_ros.core.errors import Rejection
 
 __all__ = ["MINIMUM_CORNERS", "LatticeDetection", "LatticeStatus", "find_lattice"]
 
-
-# Scales of the search for saddle points, px, in steps of 1.7. A quarter of the distance between saddle points is
-# best. The first suits the small squares of low magnifications; the largest one is bounded by the picture.
-_SCALES_PX = (2.5, 1.5, 4.2, 7.0, 12.0, 20.0, 34.0, 58.0, 99.0, 168.0, 286.0, 486.0)
-_LARGEST_SCALE_PART = 0.075
-# A view with fewer corners is refused: twice as many as determine a homography, so that there are residuals to judge
-# it by.
-MINIMUM_CORNERS = 8
-# Points of a lattice that is looked at closely: less would be a seed and its neighbours.
-_LEAST_GROWN = 6
-# How much more of the picture a less likely pattern has to cover than a likelier one of the same lattice to be taken
-# for it. Chosen, not measured.
-_MORE = 1.5
-# A lattice whose regular squares cover this part of the image will not be surpassed at another scale.
-_FILLED = 0.6
-# Part of the expected points that pass beyond which no coarser picture shows more of them.
-_CONVINCING = 0.8
-# If a larger part of the corners does not continue the lattice, that part is a second board rather
-# than cut off by debris.
-_FOREIGN_MAX = 0.15
-# Part of the power of a unit cell that no shape explains, above which it is no grid: cells of a lattice through noise
-# have 0.6 and more. Photographs leave 0.006, bright rims an eighth of the pitch wide up to 0.2, and a textured cross
-# grating 0.23.
-_MISFIT_MAX = 0.4
-# Of a chess board nothing but growth and blur changes the cell; photographs leave up to 0.004.
-_CHESS_MISFIT_MAX = 0.08
-# A hexagonal lattice of dots has 0.05 or more, and a square one with a blur of a sixth of the pitch, seen
-# at 45 degrees, has 0.001.
-_ASYMMETRY_MAX = 0.02
-# Below this a grown lattice, whose points are good to a few tenths of a pixel, shows its pattern; with
-# blurred or wrongly grown cells the fitted corners decide.
-_CLEAR_MISFIT = 0.02
-# A lattice that covers less of the image than this must show its pattern clearly: texture repeats itself by chance.
-_SMALL = 0.15
-# Square dots a half of their distance wide also make a lattice of dots and gaps, whose cells differ: what
-# is common to them has two thirds of the power or less. Lattices of different scales through the same
-# dots differ by a tenth.
-_POWER_MIN = 0.8
-# Lattices of different scales that are looked at closely.
-_LATTICES_TRIED = 4
-# Largest distance between dots that is fitted at full resolution, px: the time grows with its square, and edges that
-# are sharper than a pixel of the reduced picture lose a tenth of their certainty at most.
-_CELL_FULL_PX = 80.0
-# Least distance of points in a reduced picture, px.
-_SPACING_MIN_PX = 10.0
 
 _POINTS = {
     "chess": "corners",
@@ -113,14 +90,6 @@ _POINTS = {
     "lines": "crossings",
     "grating": "places on lines",
 }
-# Logarithm of the ratio of two areas that are the same: tilts and distortions change them by less over a picture, and
-# lattices of which one has every other point of the other differ by 0.69.
-_SAME_AREA = 0.3
-# 1-sigma along the lines of a grating, in sides of the picture: a million places tell lengths along them to 10 %.
-_ALONG = 30.0
-# Departure of the lines of a grating from even distances, in these: rough edges and noise as large as the contrast make
-# it 0.013, and three lines of a circuit 0.06.
-_UNEVEN = 0.04
 
 
 def _no_covariance() -> Array:
@@ -156,7 +125,7 @@ class LatticeDetection:
     rejected_xy
         (k, 2) expected positions of lattice points in the image that were rejected, px.
     pattern
-        What the points are: corners of a chess board, centres of dots or crosses, crossings of lines, or places on
+        What the points are: corners of a checkerboard, centres of dots or crosses, crossings of lines, or places on
         parallel lines.
     odds
         How many times as likely this pattern is as the next one; at most a million.
@@ -190,7 +159,7 @@ def find_lattice(
 
     Candidates are lattices through saddle points of the image at all scales, up to points a quarter of the picture
     apart; where none of them shows its pattern clearly, also the cells that its spatial frequencies tell (see
-    :mod:`semcal_ros.core.corners.crossed_waves`). Corners of a chess board are fitted by a model of two crossing
+    :mod:`semcal_ros.core.corners.crossed_waves`). Corners of a checkerboard are fitted by a model of two crossing
     blurred edges (see :mod:`semcal_ros.core.corners.edge_model`), which gives position and covariance; dots, crosses
     and crossings of lines by their mean cell (see :mod:`semcal_ros.core.corners.dots_and_lines`). Where edges are
     rough or blurred over many pixels, that is done in a reduced picture.
@@ -233,22 +202,22 @@ def find_lattice(
     for candidate in candidates:
         if crossed is not None and not _may_be(candidate, crossed):
             continue
-        own = _measure_likely(pyramid, candidate, wanted)
-        if isinstance(own, Rejection):
+        measured = _measure_likely(pyramid, candidate, wanted)
+        if isinstance(measured, Rejection):
             # What is said is said of the candidate that covers most of the image.
-            answer = answer or own
-        elif own is not None and (best is None or _filled_by(own) > _filled_by(best)):
-            best, is_clear = own, candidate.is_clear
-        if best is not None and candidate.filled > 0.5 * _FILLED:
+            answer = answer or measured
+        elif measured is not None and (best is None or _filled_by(measured) > _filled_by(best)):
+            best, is_clear = measured, candidate.is_clear
+        if best is not None and candidate.filled > 0.5 * FILLED_PART:
             break
     if best is not None and (is_clear or crossed is not None):
         return best
-    # Of a chess board, the corners are elsewhere than its cells.
+    # Of a checkerboard, the corners are elsewhere than its cells.
     if crossed is not None and (wanted not in ("auto", "chess") or not crossed.is_likely_chess):
-        own = _measure_likely(pyramid, crossed, wanted)
-        if isinstance(own, LatticeDetection):
-            return own
-        answer = answer or own
+        measured = _measure_likely(pyramid, crossed, wanted)
+        if isinstance(measured, LatticeDetection):
+            return measured
+        answer = answer or measured
     # Noise between parallel lines makes lattices too.
     if wanted == "auto" and isinstance(find_lines(pyramid.level, pyramid.size), Lattice):
         return Rejection(
@@ -272,7 +241,7 @@ def _measure_likely(
         if isinstance(found, Rejection):
             answer = answer or found
         # What is less likely must cover clearly more.
-        elif best is None or _filled_by(found) > _MORE * _filled_by(best):
+        elif best is None or _filled_by(found) > COVERED_RATIO * _filled_by(best):
             best = found
     return best or answer
 
@@ -280,7 +249,7 @@ def _measure_likely(
 def _find_crossed(pyramid: _Pyramid) -> _Candidate | None:
     """Return the cells of a pattern that repeats in two directions, by its frequencies."""
     places = find_cells(pyramid.level, pyramid.size)
-    if places is None or len(places.ij) < _LEAST_GROWN:
+    if places is None or len(places.ij) < GROWN_MIN:
         return None
     cells = centre_cells(pyramid.level, places)
     shapes = fit_lattice_shapes(pyramid.level, cells)
@@ -297,12 +266,12 @@ def _may_be(candidate: _Candidate, crossed: _Candidate) -> bool:
     """
     if candidate.cells is None or candidate.shapes is None or crossed.shapes is None:
         return True
-    own, other = (
+    area, other = (
         float(np.median(np.abs(np.linalg.det(cells.axes))))
         for cells in (candidate.cells, crossed.corners)
     )
-    are_parts = crossed.shapes.power < _POWER_MIN * candidate.shapes.power
-    return are_parts or abs(np.log(own / other)) < _SAME_AREA
+    are_parts = crossed.shapes.power < COMMON_POWER_MIN * candidate.shapes.power
+    return are_parts or abs(np.log(area / other)) < SAME_AREA_LOG
 
 
 def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStatus]:
@@ -323,7 +292,7 @@ def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStat
         )
     fit = fit_lines(found.ij, found.xy)
     along = fit.along
-    if fit.scatter_px > _UNEVEN * found.spacing_px:
+    if fit.scatter_px > UNEVEN_MAX * found.spacing_px:
         return Rejection(
             LatticeStatus.NO_LATTICE,
             f"no grating: lines that depart from even distances by {fit.scatter_px:.2g} px, 1-sigma, which are "
@@ -333,7 +302,7 @@ def _find_grating(pyramid: _Pyramid) -> LatticeDetection | Rejection[LatticeStat
     variance = np.einsum("ni,nij,nj->n", across, found.covariance_px2, across)
     scatter = estimate_scatter_px(found.ij, found.xy, found.covariance_px2, dimensions=1)
     variance = variance + scatter**2
-    far = np.full(len(along), (_ALONG * max(found.image_size)) ** 2)
+    far = np.full(len(along), (ALONG_SIGMA * max(found.image_size)) ** 2)
     # Places are numbered from anywhere along the lines. One of them counts as known, so that the numbers have a place.
     middle = 0.5 * (np.array(found.image_size) - 1.0)
     nearest = int(np.argmin(np.sum((found.xy - middle) ** 2, axis=1)))
@@ -381,7 +350,7 @@ class _Candidate:
     filled, regular
         Parts of the image that its squares cover, and that those of them cover which continue their neighbours.
     is_mixture
-        Whether only every other bright square is a cell, so that the lattice is not that of a chess board.
+        Whether only every other bright square is a cell, so that the lattice is not that of a checkerboard.
     """
 
     corners: Lattice
@@ -394,23 +363,23 @@ class _Candidate:
     @property
     def is_clear(self) -> bool:
         """Whether it shows its pattern."""
-        return self.shapes is not None and self.shapes.best.misfit < _CLEAR_MISFIT
+        return self.shapes is not None and self.shapes.best.misfit < CLEAR_MISFIT
 
     @property
     def is_likely_chess(self) -> bool:
-        """Whether its cells are most likely those of a chess board."""
+        """Whether its cells are most likely those of a checkerboard."""
         return self.shapes is not None and self.shapes.best.pattern == "chess"
 
 
 def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
-    """Find lattices scale by scale; a clear chess board that fills the image ends the search."""
+    """Find lattices scale by scale; a clear checkerboard that fills the image ends the search."""
     image, size = pyramid.image, pyramid.size
-    for scale in _SCALES_PX:
-        if scale > _LARGEST_SCALE_PART * min(size) and scale > _SCALES_PX[0]:
+    for scale in SCALES_PX:
+        if scale > SCALE_MAX_PART * min(size) and scale > SCALES_PX[0]:
             continue
-        octave = max(0, int(np.log2(scale / _SCALES_PX[0])))
+        octave = max(0, int(np.log2(scale / SCALES_PX[0])))
         corners = grow_at_scale(pyramid.level(octave), scale, octave, size)
-        if corners is None or len(corners.ij) < _LEAST_GROWN:
+        if corners is None or len(corners.ij) < GROWN_MIN:
             continue
         bright = bright_cells(image, corners)
         cells = None if bright is None else split_mixture(pyramid.level, bright)
@@ -421,23 +390,23 @@ def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
         candidate = _Candidate(corners, cells, shapes, filled, regular, cells is not bright)
         yield candidate
         is_chess = shapes is not None and shapes.allows("chess") and not candidate.is_mixture
-        if candidate.regular > _FILLED and candidate.is_clear and is_chess:
+        if candidate.regular > FILLED_PART and candidate.is_clear and is_chess:
             return
 
 
 def _rank(found: list[_Candidate]) -> list[_Candidate]:
     """Return the most regular candidates first, without those whose cells are mixtures of different ones."""
-    tried = [c for c in found if c.shapes is None or c.shapes.best.misfit < _MISFIT_MAX]
+    tried = [c for c in found if c.shapes is None or c.shapes.best.misfit < CELL_MISFIT_MAX]
     largest = max((c.regular for c in tried), default=0.0)
     near = [c.shapes.power for c in tried if c.shapes is not None and c.regular > 0.5 * largest]
     strongest = max(near, default=0.0)
     kept = [
         c
         for c in tried
-        if (c.is_clear or c.filled > _SMALL)
-        and (c.shapes is None or c.shapes.power >= _POWER_MIN * strongest)
+        if (c.is_clear or c.filled > SMALL_PART)
+        and (c.shapes is None or c.shapes.power >= COMMON_POWER_MIN * strongest)
     ]
-    return sorted(kept, key=lambda c: c.regular, reverse=True)[:_LATTICES_TRIED]
+    return sorted(kept, key=lambda c: c.regular, reverse=True)[:LATTICES_TRIED]
 
 
 def _likely_shapes(
@@ -448,9 +417,9 @@ def _likely_shapes(
     if shapes is None:
         # Of the few squares of a small board, none may be in view as a whole.
         return [CellShape("chess", True, 1.0, 0.0, 0.0)] if wanted in ("auto", "chess") else []
-    # Of a chess board, the corners are elsewhere than the cells of a mixture.
+    # Of a checkerboard, the corners are elsewhere than the cells of a mixture.
     may_be_chess = shapes.allows("chess") and not candidate.is_mixture
-    if shapes.asymmetry > _ASYMMETRY_MAX and not may_be_chess:
+    if shapes.asymmetry > CELL_ASYMMETRY_MAX and not may_be_chess:
         return [Rejection(LatticeStatus.NO_LATTICE, "no grid: the lattice is not square")]
     if wanted == "auto":
         likely = [s for s in shapes.every if shapes.allows(s.pattern)]
@@ -458,7 +427,7 @@ def _likely_shapes(
             likely = [s for s in shapes.every if s.pattern != "chess"]
         likely.sort(key=shapes.rank)
         return list(likely)
-    # The same points lie at the middle of dots and of crosses: only a chess board has others.
+    # The same points lie at the middle of dots and of crosses: only a checkerboard has others.
     if (shapes.best.pattern == "chess") != (wanted == "chess") and not shapes.allows(wanted):
         seen = shapes.best.pattern
         return [
@@ -480,15 +449,13 @@ def _measure(
     if shape.pattern != "chess" and candidate.cells is not None:
         spacing = np.linalg.norm(candidate.cells.axes, axis=2)
     typical = float(np.median(spacing))
-    first = (
-        0 if shape.pattern == "chess" else max(0, int(np.ceil(np.log2(typical / _CELL_FULL_PX))))
-    )
-    last = max(first, int(np.log2(typical / _SPACING_MIN_PX)))
+    first = 0 if shape.pattern == "chess" else max(0, int(np.ceil(np.log2(typical / CELL_FULL_PX))))
+    last = max(first, int(np.log2(typical / SPACING_MIN_PX)))
     for octave in range(first, last + 1):
         points = _refine(pyramid.level(octave), candidate, shape, octave)
         if points is not None and (best is None or _passed(points) > _passed(best)):
             best = points
-        if best is not None and best.quality > _CONVINCING:
+        if best is not None and best.quality > CONVINCING_PART:
             break
     if best is None:
         return Rejection(
@@ -528,7 +495,7 @@ def _refine(
 def _judge_chess(
     pyramid: _Pyramid, candidate: _Candidate, corners: RefinedCorners
 ) -> LatticeDetection | Rejection[LatticeStatus]:
-    """Return the corners if they are good enough and, as fitted, still those of a chess board."""
+    """Return the corners if they are good enough and, as fitted, still those of a checkerboard."""
     judged = _judge(corners, candidate, pyramid.size, "chess")
     if isinstance(judged, Rejection) or candidate.is_clear:
         return judged
@@ -542,7 +509,7 @@ def _judge_chess(
             LatticeStatus.OTHER_PATTERN,
             f"{PATTERN_NAMES[shapes.best.pattern]}, but not well enough in view",
         )
-    if shapes.chess.misfit > _CHESS_MISFIT_MAX:
+    if shapes.chess.misfit > CHESS_MISFIT_MAX:
         return Rejection(LatticeStatus.NO_LATTICE, "no grid: a regular pattern, but not of squares")
     return replace(judged, odds=shapes.odds_of("chess"))
 
@@ -563,13 +530,13 @@ def _judge(
             f"no grid: only {round(100 * points.quality)} % of the expected {what}"
             f" look like {what}",
         )
-    if points.foreign > max(_FOREIGN_MAX * len(points.ij), _LEAST_GROWN):
+    if points.foreign > max(FOREIGN_MAX * len(points.ij), GROWN_MIN):
         return Rejection(
             LatticeStatus.TWO_BOARDS,
             f"two boards: {points.foreign} {what} do not continue the lattice of the other"
             f" {len(points.ij)}",
         )
-    if len(points.ij) < MINIMUM_CORNERS and candidate.filled < 0.5 * _FILLED:
+    if len(points.ij) < MINIMUM_CORNERS and candidate.filled < 0.5 * FILLED_PART:
         return Rejection(
             LatticeStatus.NO_LATTICE,
             f"no grid: only {len(points.ij)} regular {what}, in"

@@ -15,8 +15,8 @@
 """Find grids of dots or holes, and gratings of crossed lines, at sub-pixel accuracy.
 
 Between the dots of a square lattice the grey value has saddle points, and so it has between the
-crossings of lines: smoothed to the spacing, all these patterns are the chess board that their
-strongest harmonics make, turned by 45 degrees. So the lattice is grown as that of a chess board, and
+crossings of lines: smoothed to the spacing, all these patterns are the checkerboard that their
+strongest harmonics make, turned by 45 degrees. So the lattice is grown as that of a checkerboard, and
 its squares are the cells of the pattern.
 """
 
@@ -28,22 +28,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Image, Indices, Mask
-from semcal_ros.core.corners.checks import (
-    CHI2_EXCESS,
-    CHI2_SIGMAS,
-    CONTRAST_MIN,
-    CORNERS_MIN,
-    MISFIT_MAX,
-    inflate_variance,
-    select_connected,
-)
+from semcal_ros.core.corners.checks import find_consistent, inflate_variance, select_connected
 from semcal_ros.core.corners.corner_fit import NoiseModel, fit_noise
 from semcal_ros.core.corners.lattice import STEPS, Lattice, enlarged, grow_best_lattice
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import find_consistent
 from semcal_ros.core.corners.pattern import CellShape, CellShapes, find_motif, fit_shapes
 from semcal_ros.core.corners.saddle import SaddlePoints, find_saddles
+from semcal_ros.core.corners.thresholds import (
+    CELL_SAMPLE,
+    CELL_SAMPLE_MIN,
+    CELL_SAMPLE_PIXELS,
+    CELL_SINE_MIN,
+    CHI2_EXCESS,
+    CHI2_SIGMAS,
+    COARSE_SAMPLE,
+    COARSE_SAMPLE_PIXELS,
+    CONTRAST_MIN,
+    CORNERS_COMPARED_MIN,
+    FULL_RESOLUTION_PX,
+    LAST_ROUNDS,
+    LAST_STEP_MAX_PX,
+    MEAN_ROUNDS,
+    MISFIT_VISIBLE,
+    MIXTURE_MIN,
+    MIXTURE_ROUNDS,
+    OUTLINE_SHOWN_MIN,
+)
 from semcal_ros.core.corners.unit_cell import (
     CellFit,
     UnitCell,
@@ -53,44 +64,6 @@ from semcal_ros.core.corners.unit_cell import (
     gather_cells,
 )
 from semcal_ros.core.corners.window import PixelWindows
-
-__all__ = [
-    "bright_cells",
-    "centre_cells",
-    "count_regular_area",
-    "fit_lattice_shapes",
-    "grow_at_scale",
-    "refine_cells",
-    "split_mixture",
-]
-
-
-# Distance between cells up to which they are classified at full resolution, px: the coarse mean has 16 bins.
-COARSE_PX = 64.0
-# Least sine of the angle between the axes of a cell: a tilt of 75 degrees makes it so acute.
-LEAST_SINE = 0.25
-# Mean square difference of two kinds of cells, in variances of their mean, from which they are not alike: noise in a
-# mean of 40 cells makes a hundredth at a signal to noise ratio of 1, and dots and gaps differ by several.
-MIXTURE, MIXTURE_ROUNDS = 0.5, 2
-# Cells that are averaged, and the pixels in them: a fifteenth of the noise remains.
-SAMPLE = 60
-SAMPLE_PIXELS = 400_000
-SAMPLE_MIN = 12
-# Cells for the classification, which needs less, but as many pixels of small cells as of large ones.
-SAMPLE_COARSE = 40
-COARSE_PIXELS = 100_000
-# Rounds of mean and fit. Positions from saddle points, good to a twentieth of the spacing, smear
-# the first mean; the second has converged.
-MEAN_ROUNDS = 3
-# Rounds of maps through the fitted cells, and fits along these maps. On the rim, where a cell shows only
-# in part, an error of its axes shifts it, and the maps are one-sided there.
-LAST_ROUNDS = 3
-# Least part of the outline of a dot or crossing in the image, as squared gradient. With less, an error
-# of the local map or a gradient of the brightness is no longer told from a shift: crossings of which
-# half was in view were off by two sigmas.
-SHOWN_MIN = 0.9
-# Largest last step of a fit that has converged, px, besides a hundredth of the spacing.
-STEP_MAX_PX = 0.05
 
 
 def grow_at_scale(
@@ -117,17 +90,17 @@ def grow_at_scale(
         return None
     # In noise the axes of a cell may fall onto each other: it is none.
     length = np.linalg.norm(lattice.axes, axis=2).prod(axis=1)
-    return lattice.select(np.abs(np.linalg.det(lattice.axes)) > LEAST_SINE * length)
+    return lattice.select(np.abs(np.linalg.det(lattice.axes)) > CELL_SINE_MIN * length)
 
 
 def count_regular_area(cells: Lattice) -> float:
     """Return the area, px^2, of the cells that lie where their neighbours predict them."""
     maps = fit_local_maps(cells.ij, cells.ij, cells.xy)
-    miss = np.linalg.norm(maps.xy - cells.xy, axis=1)
+    residual = np.linalg.norm(maps.xy - cells.xy, axis=1)
     spacing = np.linalg.norm(cells.axes, axis=2).min(axis=1)
     # In units of area: a lattice through noise has many small cells.
     area = np.abs(np.linalg.det(cells.axes))
-    return float(area[(miss < 0.1 * spacing) & maps.usable].sum())
+    return float(area[(residual < 0.1 * spacing) & maps.usable].sum())
 
 
 def bright_cells(image: Image, lattice: Lattice) -> Lattice | None:
@@ -182,13 +155,13 @@ def split_mixture(level: Callable[[int], Array32], cells: Lattice) -> Lattice:
     for _ in range(MIXTURE_ROUNDS):
         parity = cells.ij.sum(axis=1) % 2
         parts = [cells.select(parity == k) for k in (0, 1)]
-        if min(len(part.ij) for part in parts) < CORNERS_MIN:
+        if min(len(part.ij) for part in parts) < CORNERS_COMPARED_MIN:
             break
         means = [_mean_cell(level, part) for part in parts]
         if means[0] is None or means[1] is None:
             break
         even, odd = means[0].values, means[1].values
-        if np.mean((even - odd) ** 2) < MIXTURE * np.var(0.5 * (even + odd)):
+        if np.mean((even - odd) ** 2) < MIXTURE_MIN * np.var(0.5 * (even + odd)):
             break
         brighter = int(odd.mean() > even.mean())
         cells = _along_diagonals(parts[brighter], brighter)
@@ -216,10 +189,10 @@ def centre_cells(level: Callable[[int], Array32], cells: Lattice) -> Lattice:
 def _mean_cell(level: Callable[[int], Array32], cells: Lattice) -> UnitCell | None:
     """Return a coarse mean of some cells."""
     spacing = float(np.median(np.linalg.norm(cells.axes, axis=2)))
-    octave = max(0, int(np.ceil(np.log2(spacing / COARSE_PX))))
+    octave = max(0, int(np.ceil(np.log2(spacing / FULL_RESOLUTION_PX))))
     image, cells = level(octave), cells.reduced(2.0**octave)
     area = max(float(np.median(np.abs(np.linalg.det(cells.axes)))), 1.0)
-    most = max(SAMPLE_COARSE, int(COARSE_PIXELS / area))
+    most = max(COARSE_SAMPLE, int(COARSE_SAMPLE_PIXELS / area))
     few = np.random.default_rng(0).permutation(len(cells.ij))[:most]
     count = len(few)
     # Cells may be too few for local maps, and their axes are good enough.
@@ -237,7 +210,7 @@ def _sample(image: Array32, maps: LocalMaps) -> Mask:
     inside = np.all((maps.xy >= reach) & (maps.xy <= limit - reach), axis=1) & maps.usable
     chosen = np.flatnonzero(inside)
     pixels = max(1.0, float(np.median(np.abs(maps.cell_px2))))
-    count = min(SAMPLE, max(SAMPLE_MIN, int(SAMPLE_PIXELS / pixels)))
+    count = min(CELL_SAMPLE, max(CELL_SAMPLE_MIN, int(CELL_SAMPLE_PIXELS / pixels)))
     picked = np.random.default_rng(0).permutation(chosen)[:count]
     keep = np.zeros(len(maps.xy), dtype=np.bool_)
     keep[picked] = True
@@ -263,26 +236,26 @@ def refine_cells(image: Array32, cells: Lattice, shape: CellShape) -> RefinedCor
     rough, cell, noise = learnt
     maps = fit_local_maps(rough.ij, rough.ij, rough.xy, leave_out_self=False)
     rough, maps = rough.select(maps.usable), maps.select(maps.usable)
-    if len(rough.ij) < CORNERS_MIN:
+    if len(rough.ij) < CORNERS_COMPARED_MIN:
         return None
     first = _fit(image, rough.ij, maps, cell, noise, iterations=3)
-    expected = first.fit.shown > SHOWN_MIN
-    if first.good.sum() < CORNERS_MIN:
+    expected = first.fit.shown > OUTLINE_SHOWN_MIN
+    if first.good.sum() < CORNERS_COMPARED_MIN:
         return None
     quality = float(first.good[expected].mean())
     known = _fill(image, first.select(first.good), cell, noise)
     for _ in range(LAST_ROUNDS):
         maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
         known, maps = known.select(maps.usable), maps.select(maps.usable)
-        if len(known.cells) < CORNERS_MIN:
+        if len(known.cells) < CORNERS_COMPARED_MIN:
             return None
         known = _fit(image, known.cells, maps, cell, noise, iterations=2)
     last = known
-    if last.good.sum() < CORNERS_MIN:
+    if last.good.sum() < CORNERS_COMPARED_MIN:
         return None
     keep = last.good & _undisturbed(last.fit, last.good)
     keep = find_consistent(last.cells, last.maps, last.fit, keep)
-    if keep.sum() < CORNERS_MIN:
+    if keep.sum() < CORNERS_COMPARED_MIN:
         return None
     agreeing = int(keep.sum())
     keep = select_connected(last.cells, last.maps, last.fit, keep)
@@ -316,11 +289,11 @@ def _learn(
     image: Array32, cells: Lattice, is_grating: bool
 ) -> tuple[Lattice, UnitCell, NoiseModel] | None:
     """Learn the mean cell and the noise from some cells; also return all cells, centred."""
-    if len(cells.ij) < CORNERS_MIN:
+    if len(cells.ij) < CORNERS_COMPARED_MIN:
         return None
     maps = fit_local_maps(cells.ij, cells.ij, cells.xy, leave_out_self=False)
     few = _sample(image, maps)
-    if few.sum() < CORNERS_MIN:
+    if few.sum() < CORNERS_COMPARED_MIN:
         return None
     some = maps.select(few)
     windows = gather_cells(image, some)
@@ -331,7 +304,7 @@ def _learn(
     for left in range(MEAN_ROUNDS - 1, -1, -1):
         typical = float(np.median(fit.gain))
         good = (fit.gain > 0.5 * typical) & (fit.chi2 < 4.0 * float(np.median(fit.chi2)))
-        if typical <= 0.0 or good.sum() < CORNERS_MIN:
+        if typical <= 0.0 or good.sum() < CORNERS_COMPARED_MIN:
             return None
         noise = fit_noise(fit.select(good))
         some, windows, fit = some.select(good), windows.select(good), fit.select(good)
@@ -378,8 +351,8 @@ def _fit(
     fit = fit_cells(gather_cells(image, maps), maps, cell, noise, iterations=iterations)
     spacing = np.linalg.norm(maps.axes, axis=2).min(axis=1)
     moved = np.linalg.norm(fit.xy - maps.xy, axis=1)
-    good = (fit.shown > SHOWN_MIN) & (moved < 0.25 * spacing)
-    good &= fit.shift_px < STEP_MAX_PX + 0.01 * spacing
+    good = (fit.shown > OUTLINE_SHOWN_MIN) & (moved < 0.25 * spacing)
+    good &= fit.shift_px < LAST_STEP_MAX_PX + 0.01 * spacing
     good &= np.isfinite(fit.chi2)
     if np.any(good):
         good &= fit.gain > CONTRAST_MIN * float(np.median(fit.gain[good]))
@@ -392,7 +365,7 @@ def _undisturbed(fit: CellFit, good: Mask) -> Mask:
     significant = fit.chi2 > pooled * (1.0 + CHI2_EXCESS + CHI2_SIGMAS * np.sqrt(2.0 / fit.freedom))
     surplus = fit.variance.mean(axis=1) * np.maximum(1.0 - pooled / fit.chi2, 0.0)
     contrast = 0.5 * np.abs(fit.level[:, 1] - fit.level[:, 0])
-    return ~(significant & (surplus > (MISFIT_MAX * contrast) ** 2))
+    return ~(significant & (surplus > (MISFIT_VISIBLE * contrast) ** 2))
 
 
 def _fill(image: Array32, known: _FittedCells, cell: UnitCell, noise: NoiseModel) -> _FittedCells:

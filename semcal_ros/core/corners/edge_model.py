@@ -34,40 +34,27 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32
+from semcal_ros.core.corners.thresholds import ERF_C, ERF_P, NEIGHBOUR_BLURS
 from semcal_ros.core.corners.window import PixelWindows
 
-__all__ = [
-    "ANGLES",
-    "BRIGHTNESS",
-    "CONTRAST",
-    "GRADIENTS",
-    "GROWTH",
-    "LINEAR",
-    "LOG_BLUR",
-    "NONLINEAR",
-    "SAGITTAS",
-    "EdgeGeometry",
-    "evaluate",
-]
+# The parameters of a corner in their order: position, directions of the two edges, logarithm of the blur, extra
+# sagittas over half a square; then those that act linearly, as above.
+_NONLINEAR = ("x", "y", "angle_1", "angle_2", "log_blur", "sagitta_1", "sagitta_2")
+_LINEAR = ("b0", "bx", "by", "a0", "ax", "ay", "g1", "g2")
+_NAMES = _NONLINEAR + _LINEAR
 
 
-# Number of nonlinear parameters: x, y, direction of the edge along i and of that along j, log blur,
-# extra sagitta of the two edges over half a square.
-NONLINEAR = 7
-# Number of linear parameters, which follow: b0, bx, by, a0, ax, ay, g1, g2.
-LINEAR = 8
-# Indices of the parameters: directions of the two edges,
-ANGLES = slice(2, 4)
-# logarithm of the blur,
-LOG_BLUR = 4
-# extra sagittas,
-SAGITTAS = slice(5, 7)
-# brightness b0 and contrast a0,
-BRIGHTNESS, CONTRAST = 7, 10
-# gradients of the brightness and of the contrast,
-GRADIENTS = (slice(8, 10), slice(11, 13))
-# growth of the bright squares at the two edges.
-GROWTH = slice(13, 15)
+def _span(first: str, last: str) -> slice:
+    return slice(_NAMES.index(first), _NAMES.index(last) + 1)
+
+
+NONLINEAR, LINEAR = len(_NONLINEAR), len(_LINEAR)
+ANGLES, SAGITTAS = _span("angle_1", "angle_2"), _span("sagitta_1", "sagitta_2")
+LOG_BLUR, BRIGHTNESS, CONTRAST = (_NAMES.index(name) for name in ("log_blur", "b0", "a0"))
+# Of the brightness and of the contrast.
+GRADIENTS = (_span("bx", "by"), _span("ax", "ay"))
+# Of the bright squares at the two edges.
+GROWTH = _span("g1", "g2")
 
 
 @dataclass(frozen=True)
@@ -111,23 +98,16 @@ class EdgeGeometry:
         )
 
 
-# erf(z) = sign(z) (1 - t (c1 + t (c2 + ...)) exp(-z^2)), t = 1 / (1 + p |z|): Abramowitz and Stegun
-# 7.1.26, error below 1.5e-7, as of single precision. It shares the exponential with the derivative.
-ERF_P = np.float32(0.3275911)
-# c1 to c5.
-ERF_C = tuple(
-    np.float32(c) for c in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
-)
-# Parallel edges closer than this, in blur widths, affect the window, which ends half a square away.
-NEIGHBOUR_BLURS = 8.0
+# It shares the exponential with the derivative.
+_P, _C = np.float32(ERF_P), tuple(np.float32(c) for c in ERF_C)
 
 
 def _erf_and_bell(z: Array32) -> tuple[Array32, Array32]:
     """Return erf(z / sqrt 2) and exp(-z^2 / 2)."""
     bell = np.exp(np.float32(-0.5) * z * z)
-    t = np.float32(1.0) / (np.float32(1.0) + (ERF_P * np.float32(np.sqrt(0.5))) * np.abs(z))
-    tail = t * ERF_C[4]
-    for coefficient in ERF_C[3::-1]:
+    t = np.float32(1.0) / (np.float32(1.0) + (_P * np.float32(np.sqrt(0.5))) * np.abs(z))
+    tail = t * _C[4]
+    for coefficient in _C[3::-1]:
         tail += coefficient
         tail *= t
     tail *= bell

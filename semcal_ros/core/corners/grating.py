@@ -29,29 +29,17 @@ from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.lattice import Lattice, enlarged
 from semcal_ros.core.corners.local_phase import follow_phase
 from semcal_ros.core.corners.saddle import LatticeStatus
-from semcal_ros.core.corners.spectrum import (
-    LEAST_PERIOD_PX,
-    LEAST_PERIODS,
-    clip_levels,
-    compute_spectrum,
-    list_octaves,
+from semcal_ros.core.corners.spectrum import clip_levels, compute_spectrum, list_octaves
+from semcal_ros.core.corners.thresholds import (
+    ACROSS_POWER_MAX,
+    LINES_DEGREE,
+    LINES_POWER,
+    LINES_RING_OCTAVES,
+    NEWTON_STEPS,
+    PERIOD_MIN_PX,
+    PERIODS_MIN,
 )
 from semcal_ros.core.errors import Rejection
-
-__all__ = ["LineFit", "find_lines", "fit_lines"]
-
-# Power of the lines over the median at frequencies of the same size. The power of noise has an exponential
-# distribution: the largest of half a million values is 19 times the median, and 200 times has a chance of 1e-55.
-_PEAK = 200.0
-# Power at any frequency that is no multiple, relative to that of the lines, from which the pattern repeats across them
-# as well: equal crossed lines, dots and squares have 1.
-_ACROSS = 0.1
-# Frequencies of the same size, in octaves either way: at the least number of periods, some 70 are no multiples.
-_RING = 1.0
-# Degree of the polynomial through all places.
-_DEGREE = 5
-# Newton steps from an even lattice to the lines.
-_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -106,31 +94,31 @@ def find_lines(
     there is none: no frequency stands out, or lines or points repeat in another direction too.
     """
     waves = [_find_clearest_wave(level(octave), octave) for octave in list_octaves(size)]
-    found = [wave for wave in waves if wave is not None and wave.power > _PEAK]
+    found = [wave for wave in waves if wave is not None and wave.power > LINES_POWER]
     if not found:
         return Rejection(
             LatticeStatus.NO_LATTICE, "no grating: no spatial frequency stands out of the picture"
         )
     # The finest scale sees most of what lies across the lines.
     wave = found[0]
-    if wave.across > _ACROSS:
+    if wave.across > ACROSS_POWER_MAX:
         return Rejection(
             LatticeStatus.OTHER_PATTERN,
             "no grating: frequencies in another direction are as strong, as of a pattern that repeats in two: set the"
             " pattern to auto",
         )
     # The coarsest scale that resolves them is as good as any for the phase, and costs least.
-    octave = max(0, int(np.log2(wave.period_px / wave.multiple / (1.6 * LEAST_PERIOD_PX))))
+    octave = max(0, int(np.log2(wave.period_px / wave.multiple / (1.6 * PERIOD_MIN_PX))))
     image = clip_levels(level(octave)) if wave.is_clipped else level(octave)
     lattice = _follow(image, wave.multiple * wave.frequency * 2.0 ** (octave - wave.octave))
     if isinstance(lattice, Rejection):
         return lattice
-    own = np.all(lattice.ij % wave.multiple == 0, axis=1)
+    of_period = np.all(lattice.ij % wave.multiple == 0, axis=1)
     factor = 2.0**octave
     return Lattice(
-        lattice.ij[own] // wave.multiple,
-        enlarged(lattice.xy[own], factor),
-        lattice.axes[own] * (factor * wave.multiple),
+        lattice.ij[of_period] // wave.multiple,
+        enlarged(lattice.xy[of_period], factor),
+        lattice.axes[of_period] * (factor * wave.multiple),
     )
 
 
@@ -164,7 +152,9 @@ def fit_lines(ij: Indices, xy: Array) -> LineFit:
     middle, scale = ij.mean(axis=0), np.maximum(0.5 * np.ptp(ij, axis=0), 1.0)
     u, v = ((ij - middle) / scale).T
     # At least twice as many places as terms, and more of them for what a lens alone does not need.
-    most = next(degree for degree, least in ((_DEGREE, 150), (3, 20), (1, 0)) if len(ij) >= least)
+    most = next(
+        degree for degree, least in ((LINES_DEGREE, 150), (3, 20), (1, 0)) if len(ij) >= least
+    )
     powers = [(a, n - a) for n in range(most + 1) for a in range(n + 1)]
     basis = np.stack([u**a * v**b for a, b in powers], axis=1)
     slope = np.stack([b * u**a * v ** max(b - 1, 0) for a, b in powers], axis=1)
@@ -188,8 +178,8 @@ def _find_wave(image: Array32, octave: int) -> _Wave | None:
     """Find the strongest frequency in the middle of an image; None where it has no contrast."""
     spectrum = compute_spectrum(image)
     radius = np.hypot(spectrum.fx, spectrum.fy)
-    lowest = LEAST_PERIODS / min(spectrum.transform.shape)
-    allowed = (radius > lowest) & (radius < 1.0 / LEAST_PERIOD_PX)
+    lowest = PERIODS_MIN / min(spectrum.transform.shape)
+    allowed = (radius > lowest) & (radius < 1.0 / PERIOD_MIN_PX)
     if not np.any(allowed) or float(spectrum.power[allowed].max()) <= 0.0:
         return None
     # A hole or debris has more power at low frequencies than the lines, but in all directions.
@@ -202,7 +192,7 @@ def _find_wave(image: Array32, octave: int) -> _Wave | None:
     frequency = frequency / divisor
     aside = spectrum.is_aside(frequency)
     octaves = np.abs(np.log2(np.maximum(radius, 1e-9) / float(np.linalg.norm(frequency))))
-    others = spectrum.clearness[(octaves < _RING) & aside]
+    others = spectrum.clearness[(octaves < LINES_RING_OCTAVES) & aside]
     relative = np.minimum(spectrum.power / highest, spectrum.clearness / clearest)
     return _Wave(
         frequency,
@@ -231,9 +221,9 @@ def _follow(image: Array32, frequency: Array) -> Lattice | Rejection[LatticeStat
     ij = np.stack([i, j], axis=1).astype(np.intp)
     xy = middle + i[:, None] * across + j[:, None] * along
     first = np.round(float(phase.at(middle[None])[0]) / (2.0 * np.pi))
-    for _ in range(_STEPS):
-        miss = phase.at(xy) - 2.0 * np.pi * (first + i)
-        xy = xy - np.clip(miss / (2.0 * np.pi), -2.0, 2.0)[:, None] * across
+    for _ in range(NEWTON_STEPS):
+        residual = phase.at(xy) - 2.0 * np.pi * (first + i)
+        xy = xy - np.clip(residual / (2.0 * np.pi), -2.0, 2.0)[:, None] * across
     inside: Mask = np.all((xy >= 0.0) & (xy <= [width - 1, height - 1]), axis=1)
     inside &= np.abs(phase.at(xy) - 2.0 * np.pi * (first + i)) < 0.5
     at = np.rint(xy[inside]).astype(np.intp)

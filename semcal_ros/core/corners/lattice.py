@@ -23,29 +23,17 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.corners.saddle import SaddlePoints
+from semcal_ros.core.corners.thresholds import (
+    CELLS_TO_RIM_MAX,
+    SADDLE_DIRECTION_MAX_DEG,
+    SEARCH_RADIUS,
+    SEED_ASYMMETRY_MAX,
+    SEED_NEIGHBOURS,
+    SEED_POINTS,
+    SEEDS_TRIED,
+)
 
-__all__ = ["Lattice", "enlarged", "grow_best_lattice"]
-
-
-# Nearest saddle points among which the four neighbours of a seed are looked for: the first four
-# shells of a square lattice (4 + 4 + 4 + 8). A tilt and spurious saddle points move the four
-# neighbours beyond the first shell.
-NEIGHBOURS = 20
-# In skewed cells the directions of a saddle are off by a few degrees, and noise adds to that.
-COSINE_MIN = float(np.cos(np.deg2rad(28.0)))
-# Sum of two opposite arms over their length. Where a neighbour is missing, arms of one and of three
-# squares give 0.5.
-SEED_ASYMMETRY_MAX = 0.25
-# Distance from a prediction within which a saddle point is accepted, in squares. Below 0.5 it
-# cannot be nearer to the prediction of the next cell.
-SEARCH_RADIUS = 0.3
-# Bounds the time for images without a board.
-SEEDS_TRIED = 8
-# Number of the strongest saddle points among which seeds are looked for; one seed in the middle of
-# a board is enough.
-SEED_POINTS = 1200
-# Cells from the seed to the rim at most: with more than 1000 in a row, a tenth of a gigabyte.
-_MOST_CELLS = 1400
+COSINE_MIN = float(np.cos(np.deg2rad(SADDLE_DIRECTION_MAX_DEG)))
 # From a cell to its four neighbours.
 STEPS: Indices = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 
@@ -137,7 +125,7 @@ def _find_seeds(saddles: SaddlePoints, tree: cKDTree) -> _Seeds:
     """Find points with four symmetric neighbours of opposite contrast along the edges."""
     n = min(len(saddles.xy), SEED_POINTS)
     xy, hessian = saddles.xy[:n], saddles.hessian[:n]
-    queried = tree.query(xy, k=min(NEIGHBOURS + 1, len(saddles.xy)))
+    queried = tree.query(xy, k=min(SEED_NEIGHBOURS + 1, len(saddles.xy)))
     distance, neighbour = np.asarray(queried[0])[:, 1:], np.asarray(queried[1])[:, 1:]
     offset = saddles.xy[neighbour] - xy[:, None]
     unit = offset / np.maximum(distance, 1e-9)[:, :, None]
@@ -179,7 +167,7 @@ class _Growth:
         shortest = max(2.0, float(np.linalg.norm(axes, axis=1).min()))
         # No more cells lie in a row than would have saddle points, nor than memory allows.
         across = min(1.5 * np.hypot(*image_size) / shortest, len(saddles.xy))
-        self._half = min(_MOST_CELLS, 8 + int(across))
+        self._half = min(CELLS_TO_RIM_MAX, 8 + int(across))
         side = 2 * self._half + 1
         self._member = np.full((side, side), -1, dtype=np.int32)
         self._axes = np.zeros((side, side, 2, 2), dtype=np.float32)

@@ -22,17 +22,15 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.checks import (
-    CORNERS_MIN,
-    MARGIN_PX,
     FittedCorners,
     contrast_signs,
+    find_consistent,
     find_credible,
     find_undisturbed,
     inflate_variance,
     select_connected,
 )
 from semcal_ros.core.corners.corner_fit import (
-    ASSUMED_VARIANCE,
     NoiseModel,
     band_px,
     fit_corners,
@@ -42,32 +40,24 @@ from semcal_ros.core.corners.corner_fit import (
 from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
 from semcal_ros.core.corners.lattice import STEPS, Lattice
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import find_consistent
 from semcal_ros.core.corners.priors import (
     Learnt,
     learn,
     loose_prior,
     smooth_levels,
 )
+from semcal_ros.core.corners.thresholds import (
+    ASSUMED_VARIANCE,
+    CORNER_SAMPLE,
+    CORNER_SECOND_SAMPLE,
+    CORNERS_COMPARED_MIN,
+    FIRST_BLUR_PX,
+    GROW_ROUNDS,
+    HOPELESS_PART,
+    MARGIN_PX,
+    RIM_PART,
+)
 from semcal_ros.core.corners.window import gather_windows
-
-__all__ = ["RefinedCorners", "refine_lattice"]
-
-
-# Blur that the first fits start from; its loose prior covers 0.4 to 2.7 px within two sigma.
-FIRST_BLUR_PX = 1.0
-# Rounds of filling in; each adds a ring of cells around what has been found, and growing has found
-# most of them before.
-GROW_ROUNDS = 4
-# Corners from which noise, blur and spreads are learnt.
-SAMPLE = 40
-# Part of the sample that must pass. The finder asks for half of all corners in the end, and a
-# sample of 40 falls this far below a half by three standard deviations.
-HOPELESS = 0.25
-# Corners from which the spreads are learnt again, when noise and blur are known.
-SECOND_SAMPLE = 160
-# Corners nearer to the frame than the margin and this part of a square may fail.
-RIM_PART = 0.1
 
 
 @dataclass(frozen=True)
@@ -127,28 +117,28 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
         Grown from saddle points.
     """
     grown = _plausible(_shuffle(lattice))
-    if len(grown.ij) < CORNERS_MIN:
+    if len(grown.ij) < CORNERS_COMPARED_MIN:
         return None
     maps = fit_local_maps(grown.ij, grown.ij, grown.xy, leave_out_self=False)
     grown, maps = grown.select(maps.usable), maps.select(maps.usable)
-    if len(grown.ij) < CORNERS_MIN:
+    if len(grown.ij) < CORNERS_COMPARED_MIN:
         return None
-    few = np.arange(len(grown.ij)) < SAMPLE
+    few = np.arange(len(grown.ij)) < CORNER_SAMPLE
     start = _start(maps, grown.xy, FIRST_BLUR_PX)
     first = _first_fit(image, grown.ij[few], maps.select(few), start[few])
-    if first.good.sum() < CORNERS_MIN:
+    if first.good.sum() < CORNERS_COMPARED_MIN:
         return None
     part = _quality(first, image)
-    if part < HOPELESS:
+    if part < HOPELESS_PART:
         return _result(first, first.good, part, first.maps.xy[~first.good])
     knowledge = _learn(first)
     maps, start = _better_maps(grown, first, knowledge.blur_px)
     grown, maps, start = grown.select(maps.usable), maps.select(maps.usable), start[maps.usable]
-    if len(grown.ij) < CORNERS_MIN:
+    if len(grown.ij) < CORNERS_COMPARED_MIN:
         return None
     second = _fit(image, grown.ij, maps, start, knowledge, iterations=2)
     part = _quality(second, image)
-    if second.good.sum() < CORNERS_MIN:
+    if second.good.sum() < CORNERS_COMPARED_MIN:
         return None
     known = _fill(image, second.select(second.good), knowledge)
     last = _last_fit(image, known, knowledge)
@@ -156,7 +146,7 @@ def refine_lattice(image: Array32, lattice: Lattice) -> RefinedCorners | None:
         return None
     keep = last.good & find_undisturbed(last)
     keep = find_consistent(last.cells, last.maps, last.fit, keep)
-    if keep.sum() < CORNERS_MIN:
+    if keep.sum() < CORNERS_COMPARED_MIN:
         return None
     agreeing, keep = int(keep.sum()), select_connected(last.cells, last.maps, last.fit, keep)
     passed = last.cells[keep]
@@ -230,9 +220,9 @@ def _result(
 def _plausible(lattice: Lattice) -> Lattice:
     """Return the lattice without points that do not fit their neighbours."""
     maps = fit_local_maps(lattice.ij, lattice.ij, lattice.xy)
-    miss = np.linalg.norm(maps.xy - lattice.xy, axis=1)
+    residual = np.linalg.norm(maps.xy - lattice.xy, axis=1)
     spacing = np.linalg.norm(lattice.axes, axis=2).min(axis=1)
-    keep = (miss < 0.3 * spacing) & maps.usable
+    keep = (residual < 0.3 * spacing) & maps.usable
     return lattice.select(keep)
 
 
@@ -261,7 +251,7 @@ def _learn(first: FittedCorners) -> _Knowledge:
 
 def _relearn(known: FittedCorners, knowledge: _Knowledge) -> _Knowledge:
     """Learn again from the second fits; the first ones knew neither blur nor noise."""
-    few = known.select(np.arange(len(known.cells)) < SECOND_SAMPLE)
+    few = known.select(np.arange(len(known.cells)) < CORNER_SECOND_SAMPLE)
     geometry = EdgeGeometry.from_map(few.maps.axes, few.maps.bend)
     prior = knowledge.learnt.prior(few.maps, geometry)
     noise = float(np.median(few.fit.chi2))
@@ -292,7 +282,7 @@ def _last_fit(image: Array32, known: FittedCorners, knowledge: _Knowledge) -> Fi
     """Fit once more, with maps and levels through the corners themselves."""
     maps = fit_local_maps(known.cells, known.cells, known.fit.xy, leave_out_self=False)
     known, maps = known.select(maps.usable), maps.select(maps.usable)
-    if len(known.cells) < CORNERS_MIN:
+    if len(known.cells) < CORNERS_COMPARED_MIN:
         return None
     knowledge = _relearn(known, knowledge)
     geometry = EdgeGeometry.from_map(maps.axes, maps.bend)

@@ -22,21 +22,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices, Mask
-
-__all__ = ["LocalMaps", "fit_local_maps"]
-
-
-# With many corners the squares are small and a quadratic over 5 x 5 corners follows any lens; with
-# few, large squares the third order matters.
-CUBIC_BELOW = 300
-# Ridges that hold terms at zero where the neighbours do not determine them, in units of the weight
-# of one neighbour. Among all neighbours of a 5 x 5 block the one on the second order takes a
-# thousandth off a bend.
-SECOND_ORDER_RIDGE = 1e-2
-# Larger, since few neighbours determine the third order worse.
-THIRD_ORDER_RIDGE = 3e-2
-# Three neighbours determine a linear map.
-SUPPORT_MIN = 3
+from semcal_ros.core.corners.thresholds import (
+    CUBIC_BELOW,
+    SECOND_ORDER_RIDGE,
+    SUPPORT_MIN,
+    THIRD_ORDER_RIDGE,
+)
 
 
 @dataclass(frozen=True)

@@ -28,22 +28,16 @@ from numpy.polynomial.polynomial import polygrid2d, polyval2d
 from scipy import ndimage
 
 from semcal_ros.core.arrays import Array, Array32, Mask
+from semcal_ros.core.corners.thresholds import (
+    DEMODULATION_PERIODS,
+    LINES_AMPLITUDE_MIN,
+    LOST_PHASE_RAD,
+    PATTERN_DEMODULATION_PERIODS,
+    PHASE_DEGREE,
+    PHASE_PLACES_MAX,
+)
 
-__all__ = ["LocalPhase", "SmoothPhase", "follow_phase"]
-
-# Standard deviation of the low pass behind the demodulation, in periods: harmonics are down to 4e-5.
-_SMOOTH = 0.75
-# The same in periods of a pattern, whose other frequencies are as far as its own from a multiple: down to 2 %.
-_APART = 0.45
-# Degree of the smooth part of the phase. The rest is added to it.
-_DEGREE = 5
-_POWERS = [(a, n - a) for n in range(1, _DEGREE + 1) for a in range(n + 1)]
-# Places across a picture at which the phase is compared with the next, at most.
-_FINEST = 128
-# Part of the median amplitude below which there are no lines, such as under debris or beyond the end of the grating.
-_FAINT = 0.3
-# Residual phase beyond which lines were not followed, rad: half a period is pi.
-_LOST = 2.0
+_POWERS = [(a, n - a) for n in range(1, PHASE_DEGREE + 1) for a in range(n + 1)]
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,7 @@ class SmoothPhase:
     @property
     def _matrix(self) -> Array:
         """Coefficients of u^a v^b at [a, b]."""
-        matrix = np.zeros((_DEGREE + 1, _DEGREE + 1))
+        matrix = np.zeros((PHASE_DEGREE + 1, PHASE_DEGREE + 1))
         matrix[tuple(np.transpose(_POWERS))] = self.coefficients
         return matrix
 
@@ -132,14 +126,16 @@ def follow_phase(
     height, width = image.shape
     period = float(1.0 / np.linalg.norm(frequency))
     amplitude, rate, values = _demodulate(
-        image, frequency, max(_SMOOTH * period, _APART * (period_px or 0.0))
+        image,
+        frequency,
+        max(DEMODULATION_PERIODS * period, PATTERN_DEMODULATION_PERIODS * (period_px or 0.0)),
     )
     smooth = _fit_phase(amplitude, values, period)
     turned = values * np.exp(-1j * smooth.of_pixels(width, height))
     constant = float(np.angle(np.sum(turned * amplitude**2)))
     left = np.angle(turned * np.exp(-1j * constant))
-    seen = amplitude > _FAINT * float(np.median(amplitude))
-    if float(np.mean(np.abs(left[seen]) > _LOST)) > 0.1:
+    seen = amplitude > LINES_AMPLITUDE_MIN * float(np.median(amplitude))
+    if float(np.mean(np.abs(left[seen]) > LOST_PHASE_RAD)) > 0.1:
         return None
     return LocalPhase(rate, smooth, left + constant, seen)
 
@@ -166,7 +162,7 @@ def _fit_phase(amplitude: Array, values: Array, period: float) -> SmoothPhase:
     """Fit a polynomial without a constant to the phase of phasors, by the differences of neighbours."""
     height, width = amplitude.shape
     # Fine enough for a bend of a quarter of a period per period, if 1000 px wide.
-    step = max(1, round(period), min(height, width) // _FINEST)
+    step = max(1, round(period), min(height, width) // PHASE_PLACES_MAX)
     fitted = SmoothPhase(
         0.5 * np.array([width - 1, height - 1]), 0.5 * max(width, height), np.zeros(0)
     )

@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tell chess boards, dots, crosses and crossed lines apart by the Fourier coefficients of their unit cell.
+"""Tell checkerboards, dots, crosses and crossed lines apart by the Fourier coefficients of their unit cell.
 
-All of them repeat on a square lattice, and a chess board is a lattice of squares that touch at their
+All of them repeat on a square lattice, and a checkerboard is a lattice of squares that touch at their
 corners. What differs is the shape of the bright part: a square on its tip (chess), a disc (dots,
 holes), a plus sign (crosses), or a square in line with the lattice (the opening between crossed
 lines). Its transform is known in closed form; size and blur are fitted for each shape, and the best
@@ -32,21 +32,29 @@ from numpy.typing import NDArray
 from scipy.special import j1
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.corners.thresholds import (
+    AMBIGUOUS_RATIO,
+    ARM_LENGTHS,
+    ARM_WIDTHS,
+    CHESS_SIZES,
+    COMPARABLE_RATIO,
+    HARMONIC_ORDERS,
+    LINES_OPENING_MIN,
+    MOTIF_BLURS,
+    MOTIF_SIZES,
+    MOTIF_STEP,
+    ODDS_MAX,
+    RELIEF_ASIDE_MIN,
+    RELIEF_GAIN_MIN,
+    RELIEF_MISFIT_MAX,
+    RELIEF_SHIFTS,
+    RIM_DIMNESS,
+    RIM_WIDTHS,
+    SHAPE_MISFIT_LEAST,
+    SHAPES_FOR_CENTRE,
+)
 from semcal_ros.core.corners.unit_cell import UnitCell
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = [
-    "PATTERNS",
-    "PATTERN_NAMES",
-    "CellShape",
-    "CellShapes",
-    "Pattern",
-    "PatternChoice",
-    "check_pattern",
-    "describe_odds",
-    "find_motif",
-    "fit_shapes",
-]
 
 #: What a grid consists of.
 Pattern = Literal["chess", "dots", "crosses", "lines", "grating"]
@@ -64,45 +72,6 @@ PATTERN_NAMES = {
 
 # What is taken for likely where nothing else decides, first to last.
 _COMMONEST: dict[Pattern, int] = {"chess": 0, "dots": 1, "lines": 1, "crosses": 2}
-# Harmonics up to this order: with more, small spacings would be judged by noise.
-ORDERS = 4
-# Ratio of the misfits of a pattern and of the best one up to which both are possible: with 28
-# harmonics, noise alone exceeds it once in 30 images (F test).
-AMBIGUOUS = 2.0
-# The same, up to which a chess board is presumed: odds of 20 to one with the 28 harmonics, 20^(2 / 28).
-COMPARABLE = 1.24
-# Misfit that the steps of sizes and blurs cause.
-MISFIT_LEAST = 2e-4
-# Diameters of discs and sides of squares, in cells; and blurs.
-SIZES: Array = np.linspace(0.08, 0.98, 46)
-CHESS_SIZES: Array = np.linspace(0.82, 1.0, 10)
-BLURS: Array = np.linspace(0.0, 0.24, 13)
-# Half lengths of the arms of crosses, from their centre, and widths of the arms, in cells. Longer arms meet: lines.
-ARM_LENGTHS: Array = np.linspace(0.2, 0.44, 7)
-ARM_WIDTHS: Array = np.linspace(0.06, 0.42, 13)
-# Edges are brighter than faces: a rim of this width, in cells, and the part of its brightness that the face lacks.
-RIMS: Array = np.array([0.05, 0.1])
-DIMNESS: Array = np.array([0.25, 0.5, 0.75])
-# Least opening between lines, in cells. Square dots that wide could as well be what bars 0.45 of their distance wide
-# leave open.
-LINES_LEAST = 0.55
-# Where a relief may have shifted the centre of symmetry to, in cells.
-RELIEF_SHIFTS: Array = np.linspace(-0.2, 0.2, 9)
-# The middle of a motif is looked for in such steps, in cells: within the reach of the centre of symmetry.
-MOTIF_STEP = 1.0 / 12.0
-# Of so many shapes, one is enough to find the centre under a relief.
-SOME = 7
-# By how much a relief has to lower what is left of the power: noise does so once in 10 000 cells, by its four numbers
-# among 56 (F test).
-RELIEF_GAIN = 1.6
-# The most that a relief may leave: replicas with bright edges leave up to 0.23, and pads half as wide as their
-# distance, seen about the middle between two of them, 0.34.
-RELIEF_MOST = 0.25
-# Least part of the power that is at no multiples of one frequency: parallel lines, which the derivative of any shape
-# explains, have 0.005, and crossed ones of which one direction is hardly seen 0.05.
-RELIEF_ASIDE = 0.03
-# A million: odds beyond this say nothing more.
-ODDS_MAX = 1e6
 
 
 @dataclass(frozen=True)
@@ -174,15 +143,15 @@ class CellShapes:
 
     def allows(self, pattern: Pattern) -> bool:
         """Whether it may be this pattern: whether no other one is much more likely."""
-        return self.get(pattern).misfit <= AMBIGUOUS * self._least.misfit
+        return self.get(pattern).misfit <= AMBIGUOUS_RATIO * self._least.misfit
 
     def rank(self, shape: CellShape) -> tuple[int, float]:
         """Return what sorts shapes by how likely they are; of those that are about as likely, the commoner comes first.
 
-        Any blurred pattern may be a chess board, and blurred or stubby crosses may be dots, which have the same middle.
-        A chess board has other points, by which the scale would be wrong: it is not presumed by as much.
+        Any blurred pattern may be a checkerboard, and blurred or stubby crosses may be dots, which have the same
+        middle. A checkerboard has other points, by which the scale would be wrong: it is not presumed by as much.
         """
-        ratio = COMPARABLE if shape.pattern == "chess" else AMBIGUOUS
+        ratio = COMPARABLE_RATIO if shape.pattern == "chess" else AMBIGUOUS_RATIO
         if shape.misfit > ratio * self._least.misfit:
             return len(_COMMONEST), shape.misfit
         return _COMMONEST[shape.pattern], shape.misfit
@@ -257,16 +226,18 @@ def describe_odds(odds: float) -> str:
 
 def _harmonics() -> tuple[Array, Array]:
     """Return the orders (h, k) of one of each pair of opposite coefficients."""
-    orders = np.arange(-ORDERS, ORDERS + 1)
+    orders = np.arange(-HARMONIC_ORDERS, HARMONIC_ORDERS + 1)
     h, k = (g.ravel() for g in np.meshgrid(orders, orders, indexing="ij"))
-    half = ((h > 0) | ((h == 0) & (k > 0))) & (h * h + k * k <= ORDERS * ORDERS + 1)
+    half = ((h > 0) | ((h == 0) & (k > 0))) & (
+        h * h + k * k <= HARMONIC_ORDERS * HARMONIC_ORDERS + 1
+    )
     return h[half], k[half]
 
 
 def _list_rims(width: float) -> list[tuple[float, float]]:
     """Return no rim, and the rims that a face of this width can have, each with how much dimmer the face is."""
-    rims = [float(rim) for rim in RIMS if 2.0 * rim < width]
-    return [(0.0, 0.0), *((rim, float(dimness)) for rim in rims for dimness in DIMNESS)]
+    rims = [float(rim) for rim in RIM_WIDTHS if 2.0 * rim < width]
+    return [(0.0, 0.0), *((rim, float(dimness)) for rim in rims for dimness in RIM_DIMNESS)]
 
 
 def _disc(size: float, radius: Array) -> Array:
@@ -295,7 +266,7 @@ def _shapes() -> _Shapes:
     rows: list[tuple[bool, float, float, Array]] = []
 
     def add(name: Pattern, size: float, transform: Array) -> None:
-        for blur in BLURS:
+        for blur in MOTIF_BLURS:
             soft = transform * np.exp(-2.0 * np.pi**2 * blur**2 * radius**2)
             for centred in (True, False):
                 # A shift by half a cell along both axes.
@@ -303,9 +274,9 @@ def _shapes() -> _Shapes:
                 names.append(name)
                 rows.append((centred, size, float(blur), moved / np.linalg.norm(moved)))
 
-    for size in map(float, SIZES):
+    for size in map(float, MOTIF_SIZES):
         # Openings wider than this leave lines between them; narrower ones are square dots.
-        squares: Pattern = "lines" if size >= LINES_LEAST else "dots"
+        squares: Pattern = "lines" if size >= LINES_OPENING_MIN else "dots"
         # With rims, pads and wide bars could not be told apart.
         add(squares, size, _square(size, h, k))
         for rim, dimness in _list_rims(size):
@@ -321,7 +292,7 @@ def _shapes() -> _Shapes:
             add("chess", size, _tip(side, h, k) - dimness * _tip(side - 2.0 * rim, h, k))
     centred, sizes, blurs, values = (np.array(column) for column in zip(*rows, strict=True))
     slopes = np.stack([values**2 @ product for product in (h * h, k * k, h * k)])
-    every, some = (_Transforms(values[::n], slopes[:, ::n]) for n in (1, SOME))
+    every, some = (_Transforms(values[::n], slopes[:, ::n]) for n in (1, SHAPES_FOR_CENTRE))
     return _Shapes(tuple(names), centred, sizes, blurs, every, some)
 
 
@@ -352,8 +323,8 @@ def fit_shapes(cell: UnitCell) -> CellShapes:
     slopes = np.zeros(2)
     shaded = _fit_relief(seen)
     least = float(shaded.left.min())
-    better = RELIEF_GAIN * least < 1.0 - float(projected.max()) / power
-    if better and least < RELIEF_MOST and _measure_aside(seen) > RELIEF_ASIDE:
+    better = RELIEF_GAIN_MIN * least < 1.0 - float(projected.max()) / power
+    if better and least < RELIEF_MISFIT_MAX and _measure_aside(seen) > RELIEF_ASIDE_MIN:
         left, slopes, even = shaded.left, shaded.slopes, power
         seen = seen * _move(*shaded.centre)
         mirrored = mirrored * np.exp(2j * np.pi * (h * shaded.centre[0] - k * shaded.centre[1]))
@@ -368,7 +339,7 @@ def fit_shapes(cell: UnitCell) -> CellShapes:
             float(shapes.sizes[index]),
             float(shapes.blurs[index]),
             # No shape explains more than its own discretisation lets it.
-            max(float(left[index]), MISFIT_LEAST),
+            max(float(left[index]), SHAPE_MISFIT_LEAST),
         )
 
     return CellShapes(best("chess"), best("dots"), best("crosses"), best("lines"), asymmetry, even)

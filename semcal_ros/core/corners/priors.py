@@ -37,36 +37,20 @@ from semcal_ros.core.corners.edge_model import (
     EdgeGeometry,
 )
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-
-__all__ = ["LARGE_SQUARE_PX", "Learnt", "Prior", "learn", "loose_prior", "smooth_levels"]
-
+from semcal_ros.core.corners.thresholds import (
+    ANGLE_PRIOR,
+    GRADIENT_LEAST,
+    GRADIENT_PRIOR,
+    GROWTH_PRIOR_PX,
+    LARGE_SQUARE_PX,
+    LIKELIHOOD_LOSS,
+    LOG_BLUR_PRIOR,
+    OUTLIER_SCORE,
+    PRIOR_SPREADS,
+    SAGITTA_PRIOR_PX,
+)
 
 PARAMETERS = NONLINEAR + LINEAR
-# Direction of an edge about that of the local map, rad. Saddle points are good to a few tenths of a
-# pixel, which over one square of 10 px is about this.
-ANGLE_PRIOR = 0.03
-# Logarithm of the blur: a factor of 1.6 about the first guess.
-LOG_BLUR_PRIOR = 0.5
-# Error of a quadratic or cubic map through few, one-sided neighbours under a strong distortion; it
-# grows as the third power of the square.
-SAGITTA_PRIOR_PX = 0.5
-# Side of the squares for which that holds: about a quarter of a 512 px image.
-LARGE_SQUARE_PX = 130.0
-# Shading over half a square, relative to the contrast of the image.
-GRADIENT_PRIOR = 0.15
-# Least deviation of a gradient that the neighbours predict: just below the step of an 8-bit image,
-# 1 / 255 of its range.
-GRADIENT_LEAST = 0.003
-# Growth of the bright squares times contrast, px.
-GROWTH_PRIOR = 0.3
-# Spreads that are tried, relative to the loose ones above; those above 1 only where the corners show
-# more than the loose ones allow.
-SPREADS: Array = np.concatenate([np.geomspace(0.02, 1.0, 14), np.geomspace(1.35, 11.0, 8)])
-# Loss of log-likelihood against the best spread up to which a larger one is taken: one standard
-# deviation.
-LIKELIHOOD_LOSS = 0.5
-# Squared score at which an outlier's weight ends: three standard deviations.
-OUTLIER = 9.0
 # Parameters that share one spread.
 GROUPS = (ANGLES, slice(LOG_BLUR, LOG_BLUR + 1), SAGITTAS, *GRADIENTS, GROWTH)
 # Parameters with a value that is common to all corners of an image.
@@ -126,7 +110,7 @@ def loose_prior(maps: LocalMaps, geometry: EdgeGeometry, blur_px: float) -> Prio
     deviation[:, SAGITTAS] = sagitta[:, None]
     for gradient in GRADIENTS:
         deviation[:, gradient] = GRADIENT_PRIOR
-    deviation[:, GROWTH] = GROWTH_PRIOR
+    deviation[:, GROWTH] = GROWTH_PRIOR_PX
     mean = np.zeros_like(deviation)
     mean[:, ANGLES] = np.arctan2(maps.axes[:, :, 1], maps.axes[:, :, 0])
     mean[:, LOG_BLUR] = np.log(blur_px)
@@ -155,16 +139,18 @@ def learn(parameters: Array, normal: Array, used: Prior, unit: float, noise: flo
         deviation = used.deviation[:, group]
         # The information of the pixels alone, without the prior.
         share = np.maximum(information[:, group] - unit / deviation**2, 1e-9)
-        own = used.mean[:, group] + (parameters[:, group] - used.mean[:, group]) * (
+        likeliest = used.mean[:, group] + (parameters[:, group] - used.mean[:, group]) * (
             information[:, group] / share
         )
         variance = noise / (share * deviation**2)
         if group.start in COMMON:
-            common[group] = _weighted_median(own, 1.0 / (1.0 + variance))
+            common[group] = _weighted_median(likeliest, 1.0 / (1.0 + variance))
             centre = common[group]
         else:
             centre = used.mean[:, group]
-        spread[group] = _largest_spread(((own - centre) / deviation).ravel(), variance.ravel())
+        spread[group] = _largest_spread(
+            ((likeliest - centre) / deviation).ravel(), variance.ravel()
+        )
     return Learnt(common, spread)
 
 
@@ -179,13 +165,13 @@ def _weighted_median(values: Array, weights: Array) -> Array:
 
 def _largest_spread(score: Array, variance: Array) -> float:
     """Return the largest spread that scores with these variances do not contradict."""
-    total = SPREADS[:, None] ** 2 + variance
+    total = PRIOR_SPREADS[:, None] ** 2 + variance
     # Corners under debris count no more than others at three standard deviations.
-    cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER)).sum(axis=1)
+    cost = 0.5 * (np.log(total) + np.minimum(score**2 / total, OUTLIER_SCORE)).sum(axis=1)
     plausible = cost <= cost.min() + LIKELIHOOD_LOSS
-    if SPREADS[np.argmin(cost)] <= 1.0:
-        plausible &= SPREADS <= 1.0
-    return float(SPREADS[np.nonzero(plausible)[0][-1]])
+    if PRIOR_SPREADS[np.argmin(cost)] <= 1.0:
+        plausible &= PRIOR_SPREADS <= 1.0
+    return float(PRIOR_SPREADS[np.nonzero(plausible)[0][-1]])
 
 
 def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) -> Prior:
@@ -213,8 +199,8 @@ def smooth_levels(prior: Prior, cells: Indices, linear: Array, maps: LocalMaps) 
     slope = np.asarray(np.linalg.solve(maps.axes, smooth.axes))
     slope[:, :, 1] *= parity[:, None]
     slope *= 0.25 * np.linalg.norm(maps.axes, axis=2).sum(axis=1)[:, None, None]
-    miss = np.abs(levels - others.xy) / np.sqrt(1.0 + others.leverage)[:, None]
-    typical = np.median(miss[usable], axis=0) / 0.675
+    residual = np.abs(levels - others.xy) / np.sqrt(1.0 + others.leverage)[:, None]
+    typical = np.median(residual[usable], axis=0) / 0.675
     mean, deviation = prior.mean.copy(), prior.deviation.copy()
     for level, gradient in enumerate(GRADIENTS):
         limit = max(float(typical[level]), GRADIENT_LEAST)

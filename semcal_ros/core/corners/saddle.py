@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Saddle points of a smoothed image: the candidates for chess-board corners at one scale."""
+"""Saddle points of a smoothed image: the candidates for checkerboard corners at one scale."""
 
 from __future__ import annotations
 
@@ -24,21 +24,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.arrays import Array, Image, check_image
+from semcal_ros.core.corners.thresholds import (
+    IMAGE_SIDE_MIN_PX,
+    SADDLE_AREA,
+    SADDLE_THRESHOLD,
+    SADDLES_MIN,
+    SATURATED_MAX,
+    STRONG_RANK,
+)
 from semcal_ros.core.errors import InvalidValueError, Rejection
-
-__all__ = ["LatticeStatus", "SaddlePoints", "find_saddles", "prepare_image", "screen_image"]
-
-
-# A maximum below this part of the response of the strong saddles counts as noise. The response is
-# quadratic in the contrast, so corners with a third of the contrast of the strong ones still count.
-RELATIVE_THRESHOLD = 0.1
-# Rank of the response that stands for the strong saddles: as many corners as a usable image has at
-# least, so that a few specks brighter than the board do not set the threshold.
-STRONG_RANK = 12
-# Bounds the time: the saddle points of a lattice to which a scale is suited are four times the scale apart, and there
-# may be three times as many. An image of noise has some thousands at any scale that is looked at.
-LEAST_POINTS = 6000
-POINT_AREA = 5.0  # in squares of the scale
 
 
 class LatticeStatus(Enum):
@@ -95,7 +89,7 @@ def find_saddles(image: Image, scale_px: float) -> SaddlePoints:
 
     xx, yy, xy = derive(kernel_2, kernel_0), derive(kernel_0, kernel_2), derive(kernel_1, kernel_1)
     response = (xy * xy - xx * yy) * np.float32(scale_px**4)
-    most = max(LEAST_POINTS, int(image.size / (POINT_AREA * scale_px**2)))
+    most = max(SADDLES_MIN, int(image.size / (SADDLE_AREA * scale_px**2)))
     rows, columns = _strong_maxima(response, scale_px, most)
     hessian = np.empty((len(rows), 2, 2))
     hessian[:, 0, 0] = xx[rows, columns]
@@ -134,15 +128,8 @@ def _strong_maxima(
     order = np.argsort(-strength, kind="stable")
     if len(order):
         strong = strength[order[min(STRONG_RANK, len(order)) - 1]]
-        order = order[strength[order] > RELATIVE_THRESHOLD * strong][:most]
+        order = order[strength[order] > SADDLE_THRESHOLD * strong][:most]
     return rows[order].astype(np.int64), columns[order].astype(np.int64)
-
-
-# The squares of one colour cover half of the image: where more is at a limit of the grey values,
-# neither colour is free of it.
-SATURATED_MAX = 0.5
-# Twelve corners of the smallest squares that can be found, 6 px, take about as many pixels.
-SMALLEST_SIDE = 32
 
 
 def prepare_image(image: ArrayLike, databar_rows: int) -> NDArray[np.float32]:
@@ -154,11 +141,14 @@ def prepare_image(image: ArrayLike, databar_rows: int) -> NDArray[np.float32]:
         If it is not a two-dimensional image of numbers, or is too small.
     """
     values = check_image(image, channels=(1,), do="convert colour images to grey first")
-    if not 0 <= databar_rows <= values.shape[0] - SMALLEST_SIDE or values.shape[1] < SMALLEST_SIDE:
+    if (
+        not 0 <= databar_rows <= values.shape[0] - IMAGE_SIDE_MIN_PX
+        or values.shape[1] < IMAGE_SIDE_MIN_PX
+    ):
         raise InvalidValueError(
             f"an image of {values.shape[1]} x {values.shape[0]} px"
             f" with {databar_rows} databar rows",
-            expected=f"at least {SMALLEST_SIDE} x {SMALLEST_SIDE} px without the databar",
+            expected=f"at least {IMAGE_SIDE_MIN_PX} x {IMAGE_SIDE_MIN_PX} px without the databar",
         )
     rows = values.shape[0] - databar_rows
     return np.ascontiguousarray(values[:rows], dtype=np.float32)

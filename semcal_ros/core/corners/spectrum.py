@@ -28,50 +28,27 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from semcal_ros.core.arrays import Array, Array32, Image, Mask
-
-__all__ = [
-    "LEAST_PERIODS",
-    "LEAST_PERIOD_PX",
-    "Spectrum",
-    "clip_levels",
-    "compute_spectrum",
-    "list_octaves",
-]
-
-# Side of the part of the picture, at each of its scales, in which the frequency is looked for, px.
-_PART_PX = 1024
-#: Periods that are looked for: at least so many in the part, and so many pixels long.
-LEAST_PERIODS, LEAST_PERIOD_PX = 3.5, 5.0
-# Power at a part of the frequency that makes it the frequency: over the same median, which chance exceeds
-# once in 1e15, and over that of the frequency, whose side lobes behind the window are below.
-_SUBMULTIPLE, _SIDE_LOBE = 50.0, 1e-3
-# Bins beside the direction of the lines that belong to them: the main lobe of the window has two, and a distortion that
-# bends lines by a tenth of their frequency has as many bins as a tenth of it.
-_LOBE, _BENT = 3.0, 0.1
-# Frequencies of the lines are compared up to this multiple of the clearest one. They are known to so many bins, and
-# where lines are bent to that part of them.
-_COMPARED, _OFF, _UNSURE = 2.2, 1.0, 0.02
-_MOST_PEAKS = 12
-# Clearness over that of the clearest, from which a maximum counts: those of a hole's edge are mostly below.
-_FAINT_PEAK = 5e-3
-# Power of a multiple over that of the frequency itself from which the lines are followed by the multiple.
-_FAR_LARGER = 10.0
-# Of narrow lines many harmonics are as strong as the fundamental, and a hole has the less power the higher they are.
-_HIGHEST_HARMONIC = 9
-# Median amplitude of a frequency over that of others of its size, from which it is everywhere, and their directions;
-# and the low pass as a part of the picture: a hole of a third of the side then reaches a quarter of the places. The
-# median over some twenty independent places scatters by a sixth where there is noise alone.
-_EVERYWHERE, _PLACES = 2.5, 16
-# Of a square lattice, a frequency turned by 90 degrees is another of its own.
-_OTHER_DIRECTIONS_DEG = (25.0, 50.0, 75.0, 105.0, 130.0, 155.0)
-# Part of the pixels whose grey levels are clipped at either end: holes and debris in a fifth of the picture then have
-# no more contrast than lines that take more than that of their period.
-_CLIPPED = 0.2
-# What power is usual: the quantile in rings of this width in octaves. At the least number of periods a lobe of the
-# window takes half of a ring.
-_USUAL, _RING_OCTAVES = 0.25, 0.25
-# Standard deviation of the low pass behind the demodulation, in periods: harmonics are down to 4e-5.
-_SMOOTH = 0.75
+from semcal_ros.core.corners.thresholds import (
+    BENT_LINES_PART,
+    CLIPPED_PART,
+    DEMODULATION_PERIODS,
+    EVERYWHERE_RATIO,
+    FAINT_PEAK,
+    FREQUENCY_OFF_BINS,
+    FREQUENCY_UNSURE_PART,
+    HIGHEST_HARMONIC,
+    MULTIPLE_POWER_RATIO,
+    MULTIPLES_COMPARED,
+    OTHER_DIRECTIONS_DEG,
+    PEAKS_MAX,
+    PLACES_ACROSS,
+    RING_OCTAVES,
+    SIDE_LOBE_POWER,
+    SPECTRUM_PX,
+    SUBMULTIPLE_POWER,
+    USUAL_QUANTILE,
+    WINDOW_LOBE_BINS,
+)
 
 
 @dataclass(frozen=True)
@@ -109,20 +86,20 @@ class Spectrum:
         aside = np.hypot(
             (self.fx - along * frequency[0]) * width, (self.fy - along * frequency[1]) * height
         )
-        return np.asarray(aside > _LOBE + _BENT * self.bins_from(np.zeros(2)))
+        return np.asarray(aside > WINDOW_LOBE_BINS + BENT_LINES_PART * self.bins_from(np.zeros(2)))
 
     def centre_near(self, frequency: Array) -> Array:
         """Return the centre of the power near a frequency."""
-        own = np.where(self.bins_from(frequency) < _LOBE, self.power, 0.0)
-        return np.array([(own * self.fx).sum(), (own * self.fy).sum()]) / float(own.sum())
+        near = np.where(self.bins_from(frequency) < WINDOW_LOBE_BINS, self.power, 0.0)
+        return np.array([(near * self.fx).sum(), (near * self.fy).sum()]) / float(near.sum())
 
     def find_divisor(self, frequency: Array, lowest: float, highest: float) -> int:
         """Return by what a frequency of the lines is to be divided, so that all of them are its multiples."""
         height, width = self.transform.shape
         bins = float(np.hypot(frequency[0] * width, frequency[1] * height))
         ratios = self.find_ratios(frequency, lowest, highest)
-        tolerance = _OFF + _UNSURE * ratios * bins
-        most = max(1, min(_HIGHEST_HARMONIC, int(np.linalg.norm(frequency) / lowest)))
+        tolerance = FREQUENCY_OFF_BINS + FREQUENCY_UNSURE_PART * ratios * bins
+        most = max(1, min(HIGHEST_HARMONIC, int(np.linalg.norm(frequency) / lowest)))
         for divisor in range(1, most + 1):
             off = np.abs(ratios - np.rint(ratios * divisor) / divisor) * bins
             if np.all(off < tolerance):
@@ -134,14 +111,19 @@ class Spectrum:
 
         Every other line may differ from those beside it by a little.
         """
-        for divisor in range(_HIGHEST_HARMONIC, 1, -1):
+        for divisor in range(HIGHEST_HARMONIC, 1, -1):
             unit = frequency / divisor
             if np.linalg.norm(unit) < lowest:
                 continue
             off = self.bins_from(unit)
-            at = np.unravel_index(np.argmax(np.where(off < _LOBE, self.clearness, 0.0)), off.shape)
-            clear = self.clearness[at] > _SUBMULTIPLE and self.power[at] > _SIDE_LOBE * highest
-            if off[at] < 0.5 * _LOBE and clear and self.is_everywhere(unit):
+            at = np.unravel_index(
+                np.argmax(np.where(off < WINDOW_LOBE_BINS, self.clearness, 0.0)), off.shape
+            )
+            clear = (
+                self.clearness[at] > SUBMULTIPLE_POWER
+                and self.power[at] > SIDE_LOBE_POWER * highest
+            )
+            if off[at] < 0.5 * WINDOW_LOBE_BINS and clear and self.is_everywhere(unit):
                 return divisor
         return 1
 
@@ -151,23 +133,25 @@ class Spectrum:
         The power has a maximum there, while that of a hole rises towards lower frequencies, and it comes from
         everywhere in the picture and not from the edge of a hole.
         """
-        own = float(np.linalg.norm(frequency))
-        ratio = np.abs(self.fx * frequency[0] + self.fy * frequency[1]) / own**2
-        clearest = float(self.clearness[self.is_peak & (ratio < _COMPARED)].max())
-        among = self.clearness > max(_SUBMULTIPLE, _FAINT_PEAK * clearest)
-        among &= self.power > _SIDE_LOBE * highest
-        among &= ~self.is_aside(frequency) & (ratio > lowest / own) & (ratio < _COMPARED)
-        return np.abs(self.find_frequencies(among) @ frequency) / own**2
+        length = float(np.linalg.norm(frequency))
+        ratio = np.abs(self.fx * frequency[0] + self.fy * frequency[1]) / length**2
+        clearest = float(self.clearness[self.is_peak & (ratio < MULTIPLES_COMPARED)].max())
+        among = self.clearness > max(SUBMULTIPLE_POWER, FAINT_PEAK * clearest)
+        among &= self.power > SIDE_LOBE_POWER * highest
+        among &= (
+            ~self.is_aside(frequency) & (ratio > lowest / length) & (ratio < MULTIPLES_COMPARED)
+        )
+        return np.abs(self.find_frequencies(among) @ frequency) / length**2
 
     @cached_property
     def is_peak(self) -> Mask:
         """(h, w // 2 + 1) where the clearness is larger than around it."""
-        side = 4 * int(_LOBE) + 1
+        side = 4 * int(WINDOW_LOBE_BINS) + 1
         return np.asarray(
             self.clearness == ndimage.maximum_filter(self.clearness, side, mode="wrap")
         )
 
-    def find_frequencies(self, among: Mask, most: int = _MOST_PEAKS) -> Array:
+    def find_frequencies(self, among: Mask, most: int = PEAKS_MAX) -> Array:
         """Return the (n, 2) clearest maxima of these frequencies that most of the image has, the clearest first."""
         rows, columns = np.nonzero(self.is_peak & among)
         order = np.argsort(-self.clearness[rows, columns], kind="stable")[:most]
@@ -179,18 +163,20 @@ class Spectrum:
 
     def is_everywhere(self, frequency: Array) -> bool:
         """Whether most of the image has this frequency, more than others of its size."""
-        turns = np.radians([0.0, *_OTHER_DIRECTIONS_DEG])
+        turns = np.radians([0.0, *OTHER_DIRECTIONS_DEG])
         c, s = np.cos(turns), np.sin(turns)
         x, y = frequency
         directions = np.stack([c * x - s * y, s * x + c * y], axis=1)
-        own, *others = (self._median_amplitude(f) for f in directions)
-        return own > _EVERYWHERE * float(np.median(others))
+        amplitude, *others = (self._median_amplitude(f) for f in directions)
+        return amplitude > EVERYWHERE_RATIO * float(np.median(others))
 
     def _median_amplitude(self, frequency: Array) -> float:
         """Return the median amplitude over the places of the image, by the coefficients around the frequency."""
         size = np.array(self.transform.shape)
         period = 1.0 / float(np.linalg.norm(frequency))
-        sigma = max(_SMOOTH * period, min(float(size.min()) / _PLACES, 3.0 * period))
+        sigma = max(
+            DEMODULATION_PERIODS * period, min(float(size.min()) / PLACES_ACROSS, 3.0 * period)
+        )
         # What is beyond 3.5 standard deviations of the low pass is less than a hundredth.
         spread = size / (2.0 * np.pi * sigma)
         reach = np.minimum(np.ceil(3.5 * spread).astype(int), size // 2 - 1)
@@ -212,16 +198,16 @@ class Spectrum:
     def strongest_multiple(self, frequency: Array, most: int) -> int:
         """Return by what the frequency is multiplied where its power is largest; 1 unless another is far larger."""
         power = [
-            float(self.power[self.bins_from(m * frequency) < _LOBE].max())
+            float(self.power[self.bins_from(m * frequency) < WINDOW_LOBE_BINS].max())
             for m in range(1, most + 1)
         ]
         best = int(np.argmax(power))
-        return best + 1 if power[best] > _FAR_LARGER * power[0] else 1
+        return best + 1 if power[best] > MULTIPLE_POWER_RATIO * power[0] else 1
 
 
 def compute_spectrum(image: Image) -> Spectrum:
     """Compute the spectrum of the middle of a (h, w) image, at most 1024 px wide."""
-    height, width = (min(side, _PART_PX) for side in image.shape)
+    height, width = (min(side, SPECTRUM_PX) for side in image.shape)
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
     part = image[top : top + height, left : left + width].astype(np.float64)
     window = np.outer(np.hanning(height), np.hanning(width))
@@ -234,23 +220,23 @@ def compute_spectrum(image: Image) -> Spectrum:
 
 def list_octaves(size: tuple[int, int]) -> range:
     """Return the scales of an image of this (width, height), down to the one that a spectrum shows as a whole."""
-    return range(max(0, int(np.ceil(np.log2(max(size) / _PART_PX)))) + 1)
+    return range(max(0, int(np.ceil(np.log2(max(size) / SPECTRUM_PX)))) + 1)
 
 
 def clip_levels(image: Array32) -> Array32:
     """Clip the grey levels of an image, so that a hole or debris is no more than what lies beside the lines."""
-    low, high = np.quantile(image[::4, ::4], [_CLIPPED, 1.0 - _CLIPPED])
+    low, high = np.quantile(image[::4, ::4], [CLIPPED_PART, 1.0 - CLIPPED_PART])
     return np.clip(image, low, high)
 
 
 def _usual_power(power: Array, radius: Array) -> Array:
     """Return a low quantile of the power at frequencies of each size, interpolated between rings."""
-    at = np.log2(np.maximum(radius, radius[radius > 0.0].min())) / _RING_OCTAVES
+    at = np.log2(np.maximum(radius, radius[radius > 0.0].min())) / RING_OCTAVES
     ring = np.rint(at).astype(int)
     rings = np.unique(ring)
 
     def low(values: Array) -> float:
-        return float(np.quantile(values, _USUAL))
+        return float(np.quantile(values, USUAL_QUANTILE))
 
     usual = ndimage.labeled_comprehension(power, ring, rings, low, float, 0.0)
     return np.asarray(np.exp(np.interp(at, rings, np.log(np.maximum(usual, 1e-300)))))

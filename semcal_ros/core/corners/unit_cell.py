@@ -39,32 +39,20 @@ from semcal_ros.core.corners.corner_fit import (
     split_statistics,
 )
 from semcal_ros.core.corners.local_map import LocalMaps
+from semcal_ros.core.corners.thresholds import (
+    CELL_BLOCK_PIXELS,
+    CELL_PARAMETERS,
+    CELL_STEP_MAX,
+    CENTRE_ORDERS,
+    COARSE_BINS,
+    KNOTS_MAX,
+    KNOTS_MIN,
+    LOOKUP_ROW_PIXELS,
+    MEAN_STEPS,
+    NOISE_POWERS,
+    SAMPLES_PER_KNOT,
+)
 from semcal_ros.core.corners.window import PixelWindows, gather_windows
-
-__all__ = ["CellFit", "UnitCell", "average_cells", "bin_cells", "fit_cells", "gather_cells"]
-
-
-# Knots of the mean per cell: one per pixel of the largest spacing, which holds whatever pixels let
-# through. The bounds are for time and memory.
-KNOTS_MIN, KNOTS_MAX = 8, 128
-# Samples per knot, between which the tables of a cell are interpolated linearly: the second
-# derivative of an edge with a blur of one pixel then costs 0.2 % of its height.
-FINE = 4
-# Conjugate gradient steps towards the mean; more would only follow the noise between pixels.
-MEAN_STEPS = 12
-# Power of a Fourier coefficient of the mean, in variances of its noise, from which it is kept. The power
-# of noise has an exponential distribution: one coefficient in 8000 exceeds this.
-NOISE_POWERS = 9.0
-# Parameters of a cell: x, y, gain, offset, gradient along x and y, change of blur.
-PARAMETERS = 7
-# Largest step of a position, in spacings: a longer one may end in another part of the motif.
-STEP_MAX = 0.1
-# Cells are fitted in blocks of this number of pixels, to bound memory.
-BLOCK_PIXELS = 200_000
-# Pixels in a row of those that are looked up together.
-ROW = 1024
-# Bins along a side of a coarse mean, enough for the harmonics that tell patterns apart.
-COARSE = 16
 
 
 @dataclass(frozen=True)
@@ -116,11 +104,6 @@ class UnitCell:
             normal = basis.T @ (basis * weight[:, None])
             centre = centre + np.linalg.pinv(normal, hermitian=True) @ (basis.T @ (weight * phase))
         return float(centre[0]), float(centre[1])
-
-
-# Highest orders for the centre of symmetry, first and then: at the first guess, the phases of high
-# orders may wrap, and they are the ones that determine it well.
-CENTRE_ORDERS = (2, 3, 6)
 
 
 @dataclass(frozen=True)
@@ -180,14 +163,14 @@ def bin_cells(windows: PixelWindows, maps: LocalMaps) -> UnitCell | None:
     """
     u, v = _lattice_coordinates(windows, maps, np.zeros((len(maps.xy), 2)))
     inside = windows.valid > 0
-    row = np.floor(u[inside] * COARSE + 0.5).astype(np.int64) % COARSE
-    column = np.floor(v[inside] * COARSE + 0.5).astype(np.int64) % COARSE
-    place, value = row * COARSE + column, windows.value[inside].astype(np.float64)
-    count = np.bincount(place, minlength=COARSE**2).astype(np.float64)
+    row = np.floor(u[inside] * COARSE_BINS + 0.5).astype(np.int64) % COARSE_BINS
+    column = np.floor(v[inside] * COARSE_BINS + 0.5).astype(np.int64) % COARSE_BINS
+    place, value = row * COARSE_BINS + column, windows.value[inside].astype(np.float64)
+    count = np.bincount(place, minlength=COARSE_BINS**2).astype(np.float64)
     if count.min() == 0.0:
         return None
-    mean = np.bincount(place, value, minlength=COARSE**2) / count
-    return UnitCell(mean.reshape(COARSE, COARSE))
+    mean = np.bincount(place, value, minlength=COARSE_BINS**2) / count
+    return UnitCell(mean.reshape(COARSE_BINS, COARSE_BINS))
 
 
 def average_cells(windows: PixelWindows, maps: LocalMaps, fit: CellFit | None) -> UnitCell:
@@ -223,7 +206,7 @@ def average_cells(windows: PixelWindows, maps: LocalMaps, fit: CellFit | None) -
     coefficients, _ = cg(
         normal + ridge * sparse.eye_array(knots**2), right, rtol=1e-6, maxiter=MEAN_STEPS
     )
-    at = np.arange(knots * FINE) / FINE
+    at = np.arange(knots * SAMPLES_PER_KNOT) / SAMPLES_PER_KNOT
     values = ndimage.map_coordinates(
         coefficients.reshape(knots, knots),
         np.stack(np.meshgrid(at, at, indexing="ij")),
@@ -297,7 +280,7 @@ def fit_cells(
         Number of steps.
     """
     tables = _tables(cell, maps)
-    block = max(1, BLOCK_PIXELS // windows.x.shape[1])
+    block = max(1, CELL_BLOCK_PIXELS // windows.x.shape[1])
     parts = []
     for first in range(0, max(1, len(maps.xy)), block):
         rows = np.zeros(len(maps.xy), dtype=np.bool_)
@@ -330,11 +313,11 @@ def _look_up(tables: Array32, u: Array, v: Array) -> Array32:
     m = len(tables)
     # OpenCV wants a picture of less than 2^15 rows and columns. It rounds positions to 1/32 of a
     # sample, which is below a hundredth of a pixel.
-    rows = -(-u.size // ROW)
-    where = np.zeros((2, rows * ROW), dtype=np.float32)
+    rows = -(-u.size // LOOKUP_ROW_PIXELS)
+    where = np.zeros((2, rows * LOOKUP_ROW_PIXELS), dtype=np.float32)
     for axis, t in enumerate((v, u)):
         where[axis, : u.size] = (np.mod(t, 1.0) * m).ravel()
-    column, row = where.reshape(2, rows, ROW)
+    column, row = where.reshape(2, rows, LOOKUP_ROW_PIXELS)
     found = cv2.remap(tables, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     values = found.reshape(-1, 4)[: u.size].reshape(*u.shape, 4)
     return np.ascontiguousarray(np.moveaxis(values, -1, 0), dtype=np.float32)
@@ -350,8 +333,8 @@ def _fit_block(
     count, pixels = windows.x.shape
     inverse = np.linalg.inv(maps.axes.transpose(0, 2, 1)).astype(np.float32)
     spacing = np.linalg.norm(maps.axes, axis=2).min(axis=1)[:, None]
-    limit = STEP_MAX * spacing
-    jacobian = np.empty((count, PARAMETERS, pixels), dtype=np.float32)
+    limit = CELL_STEP_MAX * spacing
+    jacobian = np.empty((count, CELL_PARAMETERS, pixels), dtype=np.float32)
     jacobian[:, 3] = 1.0
     jacobian[:, 4], jacobian[:, 5] = windows.x, windows.y
     moved, levels = np.zeros((count, 2)), np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (count, 1))
@@ -377,7 +360,7 @@ def _fit_block(
         step = (covariance @ right[:, :, None])[:, :, 0]
         moved = moved + np.clip(step[:, :2], -limit, limit)
         levels = levels + step[:, 2:]
-    freedom = np.maximum(total - PARAMETERS, 1.0)
+    freedom = np.maximum(total - CELL_PARAMETERS, 1.0)
     chi2 = np.einsum("np,np,np->n", weight, residual, residual).astype(np.float64)
     # The last step changes chi2 as the normal equations predict.
     chi2 = np.maximum(chi2 - np.einsum("na,na->n", step, right), 0.5 * chi2) / freedom

@@ -23,15 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Array32, Mask
-
-__all__ = ["PixelWindows", "gather_windows"]
-
-
-# Windows of neighbouring corners just touch, so that no pixel is used twice and the errors are
-# independent.
-HALF_WIDTH = 0.5
-# Number of pixels in the boxes that are searched at a time, to stay in the cache.
-BLOCK_PIXELS = 60000.0
+from semcal_ros.core.corners.thresholds import WINDOW_BLOCK_PIXELS, WINDOW_HALF_WIDTH
 
 
 @dataclass(frozen=True)
@@ -104,8 +96,8 @@ def gather_windows(
         Half-width of the bands along the edges. Pixels farther from both edges carry no
         information on the position of the corner.
     """
-    reach = int(np.ceil(HALF_WIDTH * np.abs(axes).sum(axis=1).max(initial=0.0))) + 1
-    block = max(1, int(BLOCK_PIXELS / (2 * reach + 1) ** 2))
+    reach = int(np.ceil(WINDOW_HALF_WIDTH * np.abs(axes).sum(axis=1).max(initial=0.0))) + 1
+    block = max(1, int(WINDOW_BLOCK_PIXELS / (2 * reach + 1) ** 2))
     parts = []
     for first in range(0, max(1, len(origin)), block):
         rows = slice(first, first + block)
@@ -125,7 +117,7 @@ def _gather_block(
     x, y = along[None, None, :] + shift[:, :1, None], along[None, :, None] + shift[:, 1:, None]
     u = np.abs(inverse[:, 0, 0, None, None] * x + inverse[:, 0, 1, None, None] * y)
     v = np.abs(inverse[:, 1, 0, None, None] * x + inverse[:, 1, 1, None, None] * y)
-    inside = np.maximum(u, v) <= np.float32(HALF_WIDTH)
+    inside = np.maximum(u, v) <= np.float32(WINDOW_HALF_WIDTH)
     area = np.maximum(np.count_nonzero(inside, axis=(1, 2)), 1)
     columns, rows = start[:, :1] + span, start[:, 1:] + span
     inside &= ((columns >= 0) & (columns < width))[:, None, :]

@@ -27,8 +27,6 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["bin_image"]
-
 
 def bin_image(image: AnyImage, camera: ScanCamera, largest_px: int) -> tuple[AnyImage, ScanCamera]:
     """An image with no side longer than ``largest_px``, and the camera that takes it.

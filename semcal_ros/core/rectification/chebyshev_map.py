@@ -41,57 +41,34 @@ from semcal_ros.core.rectification.raw_positions import (
     deflection_from_output,
     raw_from_output,
 )
+from semcal_ros.core.rectification.thresholds import (
+    COMPARED_FACTOR,
+    COMPARED_ROWS,
+    DEFLECTION_ERROR_MAX_PX,
+    FIELD_BEYOND_STEP,
+    FIELD_DEGREES,
+    FIELD_TABLES_KEPT,
+    FIELD_TESTS,
+    MAP_DEGREES,
+    MAP_ERROR_MAX_PX,
+    MATRICES_KEPT,
+    MOVING_ERROR_MAX_PX,
+    OUTSIDE_PX,
+    SCAN_BEYOND,
+    SCAN_DEGREES,
+    SCAN_STEP_PX,
+    SCAN_TESTS,
+    SETTLED_AFTER,
+    SLOW_RESPONSE_PX,
+    TEST_OFFSET,
+    TESTED_KEPT,
+    TESTED_NEARBY,
+    TESTS_BETWEEN_NODES,
+    TESTS_PER_AXIS,
+)
 
-__all__ = ["RawMap", "SmoothMaps"]
-
-# Test points along each axis, which lie where none of the degrees has a node.
-_TESTS, _TEST_OFFSET = 9, 0.37
-_DEGREES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
-# The promise is 0.002 px; between the test points the maps may differ by more.
-_MAX_MAP_ERROR_PX = 0.001
-# With a residual field and a specimen that drifts while a departure of the field is scanned, which is known to first
-# order: a tenth of what OpenCV rounds positions by.
-_MAX_MOVING_ERROR_PX = 0.003
-# Drift during the scan of a departure up to which the specimen drifts slowly.
-_SMALL_RESPONSE_PX = 0.005
 # The first order is not tested where it is wrong by no more; the rest must then be so much better.
-_MAX_RESPONSE_ERROR_PX = _MAX_MOVING_ERROR_PX - _MAX_MAP_ERROR_PX
-# Columns and rows at which such a map is tested.
-_FIELD_TESTS = (17, 11)
-# Parts of the width and of the height by which a map may differ from a tested one without another test. Across, the
-# columns of a test are a tenth of the width apart; down, the knots of a field are a quarter of the height apart, and
-# interpolation is as good that near.
-_TESTED_NEARBY = (0.05, 0.01)
-# Tested maps that are kept: for a magnification that goes up and down, or a stage to and fro.
-_MAX_TESTED = 16
-# Rows at which the interpolation of another field is compared with that of a tested one: some four per node.
-_COMPARED_ROWS = 49
-# That comparison is in one column, of the field and not of its inverse: others are displaced by a few rows, and the
-# inverse of a field whose slope is some hundredths differs by as much. This leaves ample room.
-_COMPARED_IN_ONE_COLUMN = 2.0
-# Degrees down the image of what the field adds; across it, every column has its own values.
-_FIELD_DEGREES = (12, 24, 48)
-# Degrees down the image of what the distortion of the scan adds; across it, every column has its own values.
-_SCAN_DEGREES = (6, 12, 24, 48, 96, 192)
-# Half of that of a map: where the beam settles, an error of its deflection is one of twice as many columns.
-_MAX_DEFLECTION_ERROR_PX = 0.0005
-# Step of the table of deflections at a width of 512 px. The error is an eighth of its square times the curvature of the
-# fastest decay: 0.0002 px for each px of it.
-_SCAN_STEP_PX = 0.125
-# Rasters to which the table goes on from the middle, in straight lines as the deflections do.
-_SCAN_BEYOND = 10.0
-# Columns at which such a map is tested: where lines begin in some of the rows, over this part of the width from there,
-# after which the slowest decay is a seventh, and over the whole width. Rows between two nodes.
-_SCAN_TESTS, _SETTLED_AFTER = (65, 33, 33), 0.2
-_TESTS_BETWEEN_NODES = np.array([0.25, 0.5, 0.75])
-# Part of the height in steps of which the table of a field goes on above and below the image, as far as the drift.
-_BEYOND_STEP = 0.125
-# Whole tables of residual fields that are kept: two magnifications may take turns.
-_MAX_TABLES = 2
-# Sizes of images times degrees for which the matrices are kept; one stream needs one or two.
-_MAX_KEPT = 16
-# A raw position outside every frame, for output pixels without one: they come out as 0.
-_OUTSIDE_PX = -1e4
+_MAX_RESPONSE_ERROR_PX = MOVING_ERROR_MAX_PX - MAP_ERROR_MAX_PX
 _IDENTITY = np.eye(2, dtype=np.float32)
 
 
@@ -164,13 +141,13 @@ def _make_basis(n_pixels: int, degree: int, at: Array) -> tuple[Array, Array]:
     return nodes, matrix
 
 
-@lru_cache(maxsize=_MAX_KEPT)
+@lru_cache(maxsize=MATRICES_KEPT)
 def _make_interpolant(size: tuple[int, int], degree: int) -> _Interpolant:
     """Matrices for one size of image and one degree."""
     tests, bases = [], []
     for n_pixels in size:
         # Denser at the edges, as the nodes are and as the beam settles at the start of a line.
-        angles = np.pi * (np.arange(_TESTS) + _TEST_OFFSET) / _TESTS
+        angles = np.pi * (np.arange(TESTS_PER_AXIS) + TEST_OFFSET) / TESTS_PER_AXIS
         test = 0.5 * (n_pixels - 1) * (1.0 - np.cos(angles))
         tests.append(test)
         nodes, at_pixels = _make_basis(n_pixels, degree, np.arange(n_pixels, dtype=np.float64))
@@ -224,27 +201,27 @@ class _TestedMap:
         if (self.size, self.degree, self.raw.shape) != (other.size, other.degree, other.raw.shape):
             return False
         middle = len(self.raw) // 2
-        for axis, nearby in enumerate(_TESTED_NEARBY):
+        for axis, nearby in enumerate(TESTED_NEARBY):
             # Most of the others are told by one pixel.
             differ = abs(float(self.raw[middle, axis, 1]) - float(other.raw[middle, axis, 1]))
             if not differ <= nearby * self.size[axis]:
                 return False
-        own, field = self.camera.residual, other.camera.residual
-        assert own is not None
+        field_here, field = self.camera.residual, other.camera.residual
+        assert field_here is not None
         assert field is not None
         # The slices of one field share their knots.
-        if field.knots_y is not own.knots_y or field.knots_x is not own.knots_x:
+        if field.knots_y is not field_here.knots_y or field.knots_x is not field_here.knots_x:
             return False
-        nearby_px = np.multiply(_TESTED_NEARBY, self.size)[:, None]
+        nearby_px = np.multiply(TESTED_NEARBY, self.size)[:, None]
         if not (np.abs(self.raw - other.raw) <= nearby_px).all():
             return False
         added_px = 0.0
-        if field.coefficients is not own.coefficients:
+        if field.coefficients is not field_here.coefficients:
             norm_px = self.camera.norm_px
-            changed = other.camera.norm_px * field.coefficients - norm_px * own.coefficients
+            changed = other.camera.norm_px * field.coefficients - norm_px * field_here.coefficients
             # A spline lies between its coefficients: none of the columns has a larger error.
             left = self._remainders @ changed.reshape(len(changed), -1)
-            added_px = _COMPARED_IN_ONE_COLUMN * _largest(left)
+            added_px = COMPARED_FACTOR * _largest(left)
         return self.error_px + added_px <= other.error_px
 
     @cached_property
@@ -252,7 +229,7 @@ class _TestedMap:
         """(n, ny) what interpolation leaves of each basis function of the field down the image, at some rows."""
         assert self.camera.residual is not None
         height, nodes = self.size[1], len(self.undisplaced)
-        angles = np.pi * (np.arange(_COMPARED_ROWS) + 0.5) / _COMPARED_ROWS
+        angles = np.pi * (np.arange(COMPARED_ROWS) + 0.5) / COMPARED_ROWS
         rows = 0.5 * (height - 1) * (1.0 - np.cos(angles))
         matrix = _make_basis(height, nodes - 1, rows)[1]
         at = np.concatenate([self.undisplaced, matrix @ self.undisplaced])
@@ -289,7 +266,7 @@ class RawMap:
         x, y = np.meshgrid(np.arange(width), np.arange(top, bottom))
         xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
         raw = raw_from_output(xy, self.size, *self._exact)
-        raw[~np.all(np.isfinite(raw), axis=1)] = _OUTSIDE_PX
+        raw[~np.all(np.isfinite(raw), axis=1)] = OUTSIDE_PX
         out[:, :width] = raw[:, 0].reshape(x.shape)
         out[:, width:] = raw[:, 1].reshape(x.shape)
 
@@ -304,14 +281,14 @@ class SmoothMaps:
     """
 
     def __init__(self) -> None:
-        self._degrees: LruCache[tuple[int, int, bool, bool], int] = LruCache(_MAX_KEPT)
-        self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(_MAX_TABLES)
+        self._degrees: LruCache[tuple[int, int, bool, bool], int] = LruCache(MATRICES_KEPT)
+        self._tables: LruCache[tuple[object, ...], FieldTable | None] = LruCache(FIELD_TABLES_KEPT)
         self._seen: tuple[object, float] | None = None
         # Coils and settling hardly depend on the magnification.
-        self._scan_tables: LruCache[object, _ScanTables | None] = LruCache(_MAX_KEPT)
-        self._scan_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
-        self._field_degrees: LruCache[tuple[int, int], int] = LruCache(_MAX_KEPT)
-        self._tested: deque[_TestedMap] = deque(maxlen=_MAX_TESTED)
+        self._scan_tables: LruCache[object, _ScanTables | None] = LruCache(MATRICES_KEPT)
+        self._scan_degrees: LruCache[tuple[int, int], int] = LruCache(MATRICES_KEPT)
+        self._field_degrees: LruCache[tuple[int, int], int] = LruCache(MATRICES_KEPT)
+        self._tested: deque[_TestedMap] = deque(maxlen=TESTED_KEPT)
         # Of the frame before: where to begin.
         self._departure: Array32 | None = None
 
@@ -371,13 +348,13 @@ class SmoothMaps:
             return None
         begin_px = tables.begin_px
         smooth_degree = len(smooth._columns) - 3
-        for degree in [d for d in _SCAN_DEGREES if d >= self._scan_degrees.get(size, 0)]:
+        for degree in [d for d in SCAN_DEGREES if d >= self._scan_degrees.get(size, 0)]:
             rows = _make_field_rows(height, smooth_degree, max(degree, smooth_degree))
             columns = np.empty((len(rows.places) + 2, 2 * width), dtype=np.float32)
             columns[-2:] = smooth._columns[-2:]
             np.matmul(rows.at_nodes, smooth._columns[:-2], out=columns[:-2])
             start, apart = rows.places[:-1], np.diff(rows.places, axis=0)
-            between = np.unique((start + apart * _TESTS_BETWEEN_NODES).astype(np.intp))
+            between = np.unique((start + apart * TESTS_BETWEEN_NODES).astype(np.intp))
             matrix = rows.at_pixels[between, :-2].astype(np.float64)
             identity = np.arange(width, dtype=np.float64), rows.places.astype(np.float64)
             tested = _tested_columns(columns[:-2, :width] + identity[0] - begin_px)
@@ -393,7 +370,7 @@ class SmoothMaps:
                 missed = np.abs(matrix @ added[:, tested] - truth)
                 errors_px.append(np.max(missed[scanned], initial=0.0))
                 part += added
-            if max(errors_px) <= _MAX_MAP_ERROR_PX:
+            if max(errors_px) <= MAP_ERROR_MAX_PX:
                 self._scan_degrees.put(size, degree)
                 return RawMap(size, rows.at_pixels, columns, (camera, drift, timing))
         return None
@@ -412,11 +389,11 @@ class SmoothMaps:
         smooth = self._map_without_field(size, plain, drift, timing)
         if smooth._columns is None:
             return None
-        step = _BEYOND_STEP * height
+        step = FIELD_BEYOND_STEP * height
         # The polynomials have nodes in the first and the last row.
         outside = smooth._columns[[0, -3], width:]
         farthest = max(-float(outside[0].min()), float(outside[1].max()), 0.0)
-        beyond = step * min(np.ceil(farthest / step), 1.0 / _BEYOND_STEP)
+        beyond = step * min(np.ceil(farthest / step), 1.0 / FIELD_BEYOND_STEP)
         key = camera_key(size, camera)
         table = self._tables.get((key, beyond), None)
         if table is None and self._seen == (key, beyond):
@@ -426,7 +403,7 @@ class SmoothMaps:
         self._seen = key, beyond
         response, spread = _response(size, plain, moving, timing)
         smooth_degree = len(smooth._columns) - 3
-        for degree in [d for d in _FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
+        for degree in [d for d in FIELD_DEGREES if d >= self._field_degrees.get(size, 0)]:
             # The nodes of the field carry the rest, too.
             rows = _make_field_rows(height, smooth_degree, max(degree, smooth_degree))
             columns = np.empty((len(rows.places) + 2, 2 * width), dtype=np.float32)
@@ -450,10 +427,9 @@ class SmoothMaps:
             largest_px = cv2.norm(departure, cv2.NORM_INF)
             uncertain_px = spread * largest_px
             is_slow = (
-                response is None
-                or _largest(response - _IDENTITY) * largest_px <= _SMALL_RESPONSE_PX
+                response is None or _largest(response - _IDENTITY) * largest_px <= SLOW_RESPONSE_PX
             )
-            limit_px = _MAX_MAP_ERROR_PX if is_slow else _MAX_MOVING_ERROR_PX
+            limit_px = MAP_ERROR_MAX_PX if is_slow else MOVING_ERROR_MAX_PX
             is_known = is_slow or uncertain_px <= _MAX_RESPONSE_ERROR_PX
             made = _describe(
                 found, degree, row, limit_px - (0.0 if is_slow or not is_known else uncertain_px)
@@ -508,8 +484,8 @@ class SmoothMaps:
         """
         # Neighbouring magnifications need the same degree.
         key = (*size, camera is not None and camera.residual is not None, tables is not None)
-        limit_px = _MAX_MAP_ERROR_PX if tables is None else _MAX_DEFLECTION_ERROR_PX
-        for degree in [d for d in _DEGREES if d >= self._degrees.get(key, 0)]:
+        limit_px = MAP_ERROR_MAX_PX if tables is None else DEFLECTION_ERROR_MAX_PX
+        for degree in [d for d in MAP_DEGREES if d >= self._degrees.get(key, 0)]:
             interpolant = _make_interpolant(size, degree)
             points, nodes = interpolant.points_xy, interpolant.nodes
             if tables is None or camera is None:
@@ -518,7 +494,7 @@ class SmoothMaps:
                 reached = deflection_from_output(points, size, camera, drift, timing, tables.raw)
             departure = (reached - points).T
             at_nodes = departure[:, : nodes * nodes].reshape(2, nodes, nodes)
-            truth = departure[:, nodes * nodes :].reshape(2, _TESTS, _TESTS)
+            truth = departure[:, nodes * nodes :].reshape(2, TESTS_PER_AXIS, TESTS_PER_AXIS)
             error = interpolant.test_rows @ at_nodes @ interpolant.test_cols - truth
             largest = float(np.max(np.abs(error)))
             if not np.isfinite(largest):
@@ -562,9 +538,9 @@ def _response(
 
 def _tabulate_scan(size: tuple[int, int], camera: ScanCamera) -> _ScanTables | None:
     """Return the tables of a scan; None where the beam stands still or goes back."""
-    count = int(np.ceil(max(size) / (_SCAN_STEP_PX * np.sqrt(size[0] / 512.0)))) + 1
+    count = int(np.ceil(max(size) / (SCAN_STEP_PX * np.sqrt(size[0] / 512.0)))) + 1
     places = np.linspace(-0.5, 0.5, count)
-    places = np.concatenate([[-_SCAN_BEYOND], places, [_SCAN_BEYOND]])
+    places = np.concatenate([[-SCAN_BEYOND], places, [SCAN_BEYOND]])
     # The picture may be a part of the raster.
     raster = camera.raster
     extent = np.maximum(size, 2.0 * raster.norm_px * np.array([1.0, raster.ratio]))
@@ -588,9 +564,9 @@ def _tested_columns(since: Array) -> Indices:
     width = since.shape[1]
     begins = [int(np.argmin(np.abs(part))) for part in (since.max(axis=0), since.min(axis=0))]
     first, last = max(min(begins) - 1, 0), min(max(begins) + 1, width - 1)
-    settled = min(last + _SETTLED_AFTER * width, width - 1.0)
+    settled = min(last + SETTLED_AFTER * width, width - 1.0)
     parts = (first, last), (last, settled), (0, width - 1)
-    picked = [np.linspace(a, b, n) for (a, b), n in zip(parts, _SCAN_TESTS, strict=True)]
+    picked = [np.linspace(a, b, n) for (a, b), n in zip(parts, SCAN_TESTS, strict=True)]
     return np.unique(np.concatenate(picked).astype(np.intp))
 
 
@@ -639,8 +615,8 @@ def _measure_error(
         x, y = np.meshgrid(*at)
         xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
         undisplaced = plain.raw_from_rect(moving.moved(xy, raw))
-    miss = camera.without_residual(raw) - undisplaced
-    return float(np.max(np.abs(miss[scanned]), initial=0.0))
+    residual = camera.without_residual(raw) - undisplaced
+    return float(np.max(np.abs(residual[scanned]), initial=0.0))
 
 
 def _find_frame_edges(found: RawMap) -> Indices:
@@ -657,14 +633,14 @@ def _find_frame_edges(found: RawMap) -> Indices:
     return np.concatenate([first, last])[np.tile(inside.any(axis=0), 2)]
 
 
-@lru_cache(maxsize=_MAX_KEPT)
+@lru_cache(maxsize=MATRICES_KEPT)
 def _test_pixels(size: tuple[int, int]) -> tuple[Indices, Indices]:
     """Columns and rows at which a map with a residual field is tested, denser towards the edges."""
     columns, rows = (
         np.unique(
-            np.round(0.5 * (n - 1) * (1.0 - np.cos(np.pi * (np.arange(k) + _TEST_OFFSET) / k)))
+            np.round(0.5 * (n - 1) * (1.0 - np.cos(np.pi * (np.arange(k) + TEST_OFFSET) / k)))
         )
-        for n, k in zip(size, _FIELD_TESTS, strict=True)
+        for n, k in zip(size, FIELD_TESTS, strict=True)
     )
     return columns.astype(np.intp), rows.astype(np.intp)
 
@@ -688,7 +664,7 @@ class _FieldRows:
     at_pixels: Array32
 
 
-@lru_cache(maxsize=_MAX_KEPT)
+@lru_cache(maxsize=MATRICES_KEPT)
 def _make_field_rows(height: int, degree: int, field_degree: int) -> _FieldRows:
     pixels = np.arange(height, dtype=np.float64)
     places, field = _make_basis(height, field_degree, pixels)

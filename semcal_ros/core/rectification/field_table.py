@@ -34,22 +34,16 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.rectification.thresholds import (
+    FIELD_COLUMN_PX,
+    FIELD_CONVERGED_PX,
+    FIELD_DISPLACEMENT_MAX_PX,
+    FIELD_ROW_STEP_AT_512,
+    FIELD_ROWS_MAX,
+    FIELD_STEPS_MAX,
+    FIELD_WHOLE_PART,
+)
 
-__all__ = ["FieldTable", "tabulate_field"]
-
-# Half a pixel along the lines, where the beam settles. Down the image the knots of the field are a quarter of its
-# height apart, so that a step of a few rows does: two at 512. The error is as the square of the step times the second
-# derivative, which for the same field falls with the height.
-_COLUMN_PX = 0.5
-_MOST_ROWS = 256
-_STEP_AT_512 = 2.0
-# What further steps would add, px: less than half of what a map with a field may be wrong by.
-_SETTLED_PX = 0.0004
-_MAX_STEPS = 12
-# A larger displacement is none of a microscope, and would make a table much larger than the image.
-_LARGEST_PX = 256.0
-# Part of the rows of a table from which it is made as a whole.
-_FEW_ROWS = 0.7
 # Columns and rows are in one map.
 _NO_MAP = np.empty(0, np.float32)
 
@@ -93,9 +87,9 @@ class FieldTable:
         at.reshape(count, -1)[...] *= per_px
         at[..., 1] += self.strips
         # Each step leaves an error of at most the slope times that before it; a steeper field need not settle.
-        settled = _SETTLED_PX * max(1.0 / max(self.slope, 1e-3) - 1.0, 1.0)
+        settled = FIELD_CONVERGED_PX * max(1.0 / max(self.slope, 1e-3) - 1.0, 1.0)
         found = self._look_up(at) if start is None else start
-        for _ in range(_MAX_STEPS):
+        for _ in range(FIELD_STEPS_MAX):
             moved = found.reshape(count, -1) * per_px
             moved += at.reshape(count, -1)
             before, found = found, self._look_up(moved.reshape(at.shape))
@@ -132,7 +126,7 @@ def tabulate_field(
     assert field is not None
     # The basis functions of a spline sum to 1: no displacement is larger than the largest coefficient.
     largest = norm * float(np.max(np.abs(field.coefficients)))
-    if not largest <= _LARGEST_PX:
+    if not largest <= FIELD_DISPLACEMENT_MAX_PX:
         return None
     ends = float(field.knots_x[-1]), float(field.knots_y[-1])
     # Up to where the field ends, and becomes constant.
@@ -142,8 +136,8 @@ def tabulate_field(
         for end, count in zip(ends, size, strict=True)
     ]
     margins[1] += np.ceil(rows_beyond)
-    coarsest = _STEP_AT_512 * math.sqrt(size[1] / 512.0)
-    steps = _COLUMN_PX, max(min(size[1] / _MOST_ROWS, coarsest), 1.0)
+    coarsest = FIELD_ROW_STEP_AT_512 * math.sqrt(size[1] / 512.0)
+    steps = FIELD_COLUMN_PX, max(min(size[1] / FIELD_ROWS_MAX, coarsest), 1.0)
     columns, rows = _lattice(size, (margins[0], margins[1]), steps)
     back_px = replace(field, coefficients=-norm * field.coefficients)
     picked, strips = None, np.zeros((1, 1), np.float32)
@@ -155,7 +149,7 @@ def tabulate_field(
         first = np.floor((near.min(axis=1) - reach + margins[1]) / steps[1]).astype(np.intp) - 1
         last = np.ceil((near.max(axis=1) + reach + margins[1]) / steps[1]).astype(np.intp) + 1
         tall = int(np.max(last - first)) + 1
-        if tall * len(first) < _FEW_ROWS * len(rows):
+        if tall * len(first) < FIELD_WHOLE_PART * len(rows):
             picked = np.clip(first[:, None] + np.arange(tall), 0, len(rows) - 1).ravel()
             strips = (np.arange(len(first)) * tall - first)[:, None].astype(np.float32)
     table = back_px.on_lattice(columns / norm, rows / norm, picked)

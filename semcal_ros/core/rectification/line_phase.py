@@ -28,36 +28,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Array32
-
-__all__ = ["LinePhase", "LinePhaseCorrector", "estimate_line_phase", "remove_line_phase"]
-
-# Largest phase that is looked for, part of the width: lags are some microseconds, and lines take a millisecond.
-_LARGEST = 1.0 / 16.0
-# Lines that are compared with their neighbours, up to twice as many: they tell the phase of gold at 30 electrons to
-# 0.02 px.
-_MOST_LINES = 128
-# 1-sigma of the smoothing along the lines, px: noise of single pixels tells nothing.
-_SMOOTH_PX = 1.0
-# Gauss-Newton steps at most, and the part of the sigma that may be left.
-_STEPS, _ENOUGH = 6, 0.1
-# Groups of lines from whose scatter the sigma is told, to a sixth.
-_GROUPS = 16
-# Structure along the lines is there where neighbours have in common more than this many sigmas: the best of all shifts
-# of noise has as much in 4 of 6000 images of 20 rows, whose sigma is that of 9 lines only.
-_STRUCTURE_SIGMAS = 6.0
-# What repeats: another peak of the correlation at least so high, and a valley before it at most so, as parts of the
-# highest; and the part of the period below which the phase is taken to be.
-_AS_HIGH, _VALLEY, _OF_PERIOD = 0.8, 0.5, 0.25
-# A phase is there where it is more than this many sigmas, and this many px: of 16 groups, Student's t exceeds so many
-# sigmas in 2 of 10^4 looks.
-_SIGMAS, _LEAST_PX = 5.0, 0.1
-# Lobes of the Lanczos filter that moves lines, to each side.
-_LOBES = 4
-# Weight of the estimates before, against that of the next one: some eight of them count.
-_MEMORY = 7.0 / 8.0
-# Frames in which the phase is estimated: the first ones, and then every so many; fewer where nobody declared one.
-_FIRST_LOOKS, _LOOK_EVERY = 8, 8
-_FIRST_UNDECLARED, _EVERY_UNDECLARED = 3, 64
+from semcal_ros.core.rectification.thresholds import (
+    LANCZOS_LOBES,
+    LINE_GROUPS,
+    LINES_COMPARED,
+    PHASE_CONVERGED,
+    PHASE_EVERY,
+    PHASE_FIRST_FRAMES,
+    PHASE_MAX_PART,
+    PHASE_MEMORY,
+    PHASE_MIN_PX,
+    PHASE_OF_PERIOD,
+    PHASE_SIGMAS,
+    PHASE_STEPS_MAX,
+    REPEATED_PEAK,
+    REPEATED_VALLEY,
+    SMOOTHING_PX,
+    STRUCTURE_SIGMAS,
+    UNDECLARED_EVERY,
+    UNDECLARED_FIRST_FRAMES,
+)
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,7 @@ class LinePhase:
     @property
     def is_seen(self) -> bool:
         """Whether there is one beyond chance."""
-        return abs(self.shift_px) > max(_SIGMAS * self.sigma_px, _LEAST_PX)
+        return abs(self.shift_px) > max(PHASE_SIGMAS * self.sigma_px, PHASE_MIN_PX)
 
 
 def estimate_line_phase(image: AnyImage) -> LinePhase:
@@ -92,10 +82,10 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
         (h, w) or (h, w, 3), at least 16 lines of 32 px.
     """
     height, width = image.shape[:2]
-    largest = max(2, int(_LARGEST * width))
+    largest = max(2, int(PHASE_MAX_PART * width))
     if height < 16 or width < 32:
         return LinePhase(0.0, np.inf)
-    step = 2 * max(1, height // 2 // _MOST_LINES)
+    step = 2 * max(1, height // 2 // LINES_COMPARED)
     first = np.arange(1, height - 1, step)
     line, above, below = (_prepare(image[first + k]) for k in (0, -1, 1))
     mean = 0.5 * (above + below)
@@ -109,25 +99,25 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
     shift = float(chosen)
     frequency = np.asarray(2j * np.pi * np.fft.rfftfreq(width), dtype=np.complex64)
     margin = slice(largest + 2, width - largest - 2)
-    groups = np.arange(len(first)) * min(_GROUPS, len(first)) // len(first)
+    groups = np.arange(len(first)) * min(LINE_GROUPS, len(first)) // len(first)
     whole = np.fft.rfft(line)
     # The noise of the two has nothing in common, so that their gradients tell the structure's alone.
     fixed = np.fft.irfft(np.fft.rfft(mean) * frequency, width)[:, margin]
     sigma = np.inf
-    for _ in range(_STEPS):
+    for _ in range(PHASE_STEPS_MAX):
         moved = whole * np.exp(frequency * np.float32(shift))
         left = (np.fft.irfft(moved, width) - mean)[:, margin]
         slope = np.fft.irfft(moved * frequency, width)[:, margin]
         scores, common = np.sum(slope * left, axis=1), np.sum(slope * fixed, axis=1)
         total = float(common.sum())
-        if total <= _STRUCTURE_SIGMAS * _scatter(common, groups):
+        if total <= STRUCTURE_SIGMAS * _scatter(common, groups):
             return LinePhase(0.0, np.inf)
         step = float(scores.sum()) / total
         shift -= step
         sigma = _scatter(scores, groups) / total
         if abs(shift) > largest:
             return LinePhase(0.0, np.inf)
-        if abs(step) < _ENOUGH * sigma:
+        if abs(step) < PHASE_CONVERGED * sigma:
             break
     return LinePhase(shift, sigma)
 
@@ -138,17 +128,17 @@ def _choose_lag(correlation: Array, lags: NDArray[np.int_]) -> int | None:
     highest = float(correlation[top])
     inner = correlation[1:-1]
     is_peak = (
-        (inner >= correlation[:-2]) & (inner >= correlation[2:]) & (inner > _AS_HIGH * highest)
+        (inner >= correlation[:-2]) & (inner >= correlation[2:]) & (inner > REPEATED_PEAK * highest)
     )
     rivals = [top]
     for k in (np.flatnonzero(is_peak) + 1).tolist():
         between = correlation[min(k, top) : max(k, top) + 1]
-        if float(between.min()) < _VALLEY * highest:
+        if float(between.min()) < REPEATED_VALLEY * highest:
             rivals.append(k)
     rivals.sort(key=lambda k: abs(int(lags[k])))
     nearest = int(lags[rivals[0]])
     period = min((abs(int(lags[k]) - nearest) for k in rivals[1:]), default=0)
-    return None if len(rivals) > 1 and abs(nearest) >= _OF_PERIOD * period else nearest
+    return None if len(rivals) > 1 and abs(nearest) >= PHASE_OF_PERIOD * period else nearest
 
 
 def _scatter(values: Array, groups: NDArray[np.int_]) -> float:
@@ -161,7 +151,7 @@ def _prepare(lines: AnyImage) -> Array32:
     """Grey lines without their mean, smoothed along themselves."""
     grey = lines.mean(axis=2) if lines.ndim == 3 else lines
     smooth = cv2.GaussianBlur(
-        np.asarray(grey, dtype=np.float32), (0, 0), sigmaX=_SMOOTH_PX, sigmaY=1e-6
+        np.asarray(grey, dtype=np.float32), (0, 0), sigmaX=SMOOTHING_PX, sigmaY=1e-6
     )
     return np.asarray(smooth - smooth.mean(axis=1, keepdims=True))
 
@@ -182,9 +172,13 @@ def remove_line_phase(image: AnyImage, shift_px: float) -> AnyImage:
     for parity, moved in ((0, 0.5 * shift_px), (1, -0.5 * shift_px)):
         lines: Any = np.ascontiguousarray(image[parity::2])
         # OpenCV's own resampling rounds positions to 1/32 px.
-        reach = int(np.ceil(abs(moved))) + _LOBES
+        reach = int(np.ceil(abs(moved))) + LANCZOS_LOBES
         distance = np.arange(-reach, reach + 1) + moved
-        taps = np.sinc(distance) * np.sinc(distance / _LOBES) * (np.abs(distance) < _LOBES)
+        taps = (
+            np.sinc(distance)
+            * np.sinc(distance / LANCZOS_LOBES)
+            * (np.abs(distance) < LANCZOS_LOBES)
+        )
         out[parity::2] = cv2.sepFilter2D(
             lines, -1, taps / taps.sum(), np.array([1.0]), borderType=cv2.BORDER_REPLICATE
         )
@@ -210,10 +204,12 @@ class LinePhaseCorrector:
         """Return the frame without its line phase, in which :attr:`phase` is the mean of the last estimates."""
         if image.shape != self._size:
             self._size, self._frames, self.phase = image.shape, 0, LinePhase(0.0, np.inf)
-        looks, every = (
-            (_FIRST_LOOKS, _LOOK_EVERY) if self.declared else (_FIRST_UNDECLARED, _EVERY_UNDECLARED)
+        first, every = (
+            (PHASE_FIRST_FRAMES, PHASE_EVERY)
+            if self.declared
+            else (UNDECLARED_FIRST_FRAMES, UNDECLARED_EVERY)
         )
-        if self._frames < looks or self._frames % every == 0:
+        if self._frames < first or self._frames % every == 0:
             self._add(estimate_line_phase(image))
         self._frames += 1
         if not self.declared or not np.isfinite(self.phase.sigma_px):
@@ -240,13 +236,13 @@ class LinePhaseCorrector:
         if not np.isfinite(found.sigma_px):
             return
         apart = abs(found.shift_px - old.shift_px)
-        if not apart < _SIGMAS * np.hypot(found.sigma_px, old.sigma_px):
+        if not apart < PHASE_SIGMAS * np.hypot(found.sigma_px, old.sigma_px):
             # Another dwell or magnification has another lag.
             self.phase = found
             return
         if not np.isfinite(old.sigma_px):
             self.phase = found
             return
-        weights = np.array([_MEMORY * old.sigma_px**-2.0, max(found.sigma_px, 1e-6) ** -2.0])
+        weights = np.array([PHASE_MEMORY * old.sigma_px**-2.0, max(found.sigma_px, 1e-6) ** -2.0])
         shift = float(weights @ [old.shift_px, found.shift_px] / weights.sum())
         self.phase = LinePhase(shift, float(weights.sum() ** -0.5))

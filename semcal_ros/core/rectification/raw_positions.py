@@ -37,25 +37,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = [
-    "PixelDrift",
-    "RasterDrift",
-    "camera_key",
-    "check_drift",
-    "deflection_from_output",
-    "drift_key",
-    "raw_from_output",
-    "rotation_centre",
-    "similarity_matrix",
-]
-
-
-# Each step shrinks the error by the drift per row time over a row: a drift of half a row per row
-# takes 20 steps, one that needs more than 50 is too fast for the raster.
-_MAX_STEPS = 50
-# A hundredth of the accuracy of the maps.
-_CONVERGED_PX = 1e-5
+from semcal_ros.core.rectification.thresholds import POSITION_CONVERGED_PX, POSITION_STEPS_MAX
 
 
 @dataclass(frozen=True)
@@ -166,14 +148,14 @@ def _reach(
         return reach(shift.moved(xy))
     # What is displaced by little is scanned at nearly the time of its output pixel.
     raw, contraction = xy, shift.contraction
-    for _ in range(_MAX_STEPS):
+    for _ in range(POSITION_STEPS_MAX):
         # A contraction as long as the drift moves by much less than a row while a row is scanned.
         reached = reach(shift.moved(xy, raw))
         new = raw_from_reached(reached)
         change_px = np.abs(new - raw)
         raw = new
         # The error that remains is smaller than the step by the same factor again.
-        if not (contraction * change_px > _CONVERGED_PX).any():
+        if not (contraction * change_px > POSITION_CONVERGED_PX).any():
             return reached
     assert timing is not None
     raise InvalidValueError(

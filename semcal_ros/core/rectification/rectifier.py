@@ -43,21 +43,13 @@ from semcal_ros.core.rectification.raw_positions import (
     check_drift,
     drift_key,
 )
-
-__all__ = ["Rectifier"]
-
+from semcal_ros.core.rectification.thresholds import BAND_PIXELS, MAPS_KEPT, SIDE_MAX_PX
 
 _INTERPOLATIONS = {
     "linear": cv2.INTER_LINEAR,
     "cubic": cv2.INTER_CUBIC,
     "lanczos4": cv2.INTER_LANCZOS4,
 }
-# Both maps of a band fit a second-level cache; OpenCV resamples so few pixels in one thread.
-_BAND_PIXELS = 1 << 15
-# Whole maps that are kept, 8 bytes per pixel each: two magnifications may take turns.
-_MAX_MAPS = 2
-# cv2.remap counts rows and columns in 16 bits.
-_LARGEST_SIDE = 32766
 
 
 class Rectifier:
@@ -84,7 +76,7 @@ class Rectifier:
         self._interpolation = interpolation
         self._flag = _INTERPOLATIONS[interpolation]
         self._smooth = SmoothMaps()
-        self._maps: LruCache[tuple[object, ...], tuple[Array32, Array32]] = LruCache(_MAX_MAPS)
+        self._maps: LruCache[tuple[object, ...], tuple[Array32, Array32]] = LruCache(MAPS_KEPT)
         self._last: tuple[object, ...] | None = None
         self._scratch: deque[Array32] = deque()
 
@@ -211,7 +203,7 @@ class Rectifier:
     def _for_each_band(self, raw_map: RawMap, use: Callable[[int, int, Array32], None]) -> None:
         """Call ``use`` with first row, end and maps of all bands, in several threads."""
         width, height = raw_map.size
-        rows = max(_BAND_PIXELS // width, 1)
+        rows = max(BAND_PIXELS // width, 1)
         tops = deque(range(0, height, rows))
 
         def work() -> None:
@@ -248,10 +240,10 @@ def _helpers() -> ThreadPoolExecutor:
 
 def _check_image(image: AnyImage) -> None:
     check_image(image, types=RESAMPLED_TYPES)
-    if max(image.shape) > _LARGEST_SIDE:
+    if max(image.shape) > SIDE_MAX_PX:
         raise InvalidValueError(
             f"an image of {image.shape[1]} x {image.shape[0]} px",
-            expected=f"at most {_LARGEST_SIDE} px along each side",
+            expected=f"at most {SIDE_MAX_PX} px along each side",
         )
 
 

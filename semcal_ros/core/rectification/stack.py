@@ -34,14 +34,10 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
-
-__all__ = ["Stack", "StackSums", "StackedImage", "find_scanned"]
-
+from semcal_ros.core.rectification.thresholds import EDGE_PX
 
 # Rows or columns that an interpolation takes beyond the two nearest ones.
 _REACH_PX = {"linear": 0, "cubic": 1, "lanczos4": 3}
-# As accurate as the maps are; a pixel at the edge must not drop out by rounding.
-_EDGE_PX = 1e-3
 
 
 @dataclass(frozen=True)
@@ -230,7 +226,7 @@ def find_scanned(
         3 for lanczos4.
     """
     width, height = size
-    low = reach - _EDGE_PX
+    low = reach - EDGE_PX
     inside_x = (map_x >= low) & (map_x <= width - 1 - low)
     return np.asarray(inside_x & (map_y >= low) & (map_y <= height - 1 - low))
 

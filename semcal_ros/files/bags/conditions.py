@@ -32,8 +32,6 @@ from semcal_ros.files.bags.reader import BagReader
 from semcal_ros.files.bags.topics import topic_matches
 from semcal_ros.files.tiff.sem_image import Conditions
 
-__all__ = ["CONDITIONS_TOPIC", "ConditionsTrack", "find_conditions"]
-
 CONDITIONS_TOPIC = "conditions"
 """Topic with what the microscope says of the conditions (diagnostic_msgs/DiagnosticStatus)."""
 
@@ -68,9 +66,9 @@ class ConditionsTrack:
 
     def at(self, stamp_ns: int, log_time_ns: int) -> Conditions | None:
         """Return what is known at an image; an import's settings of the image itself count most."""
-        own = self._by_stamp.get(stamp_ns)
+        of_image = self._by_stamp.get(stamp_ns)
         held = None if self._held is None else self._held.held_at(stamp_ns, log_time_ns)
-        found = own or held
+        found = of_image or held
         return None if found == Conditions() else found
 
 
@@ -84,9 +82,9 @@ def find_conditions(reader: BagReader, image_topic: str) -> ConditionsTrack | No
 
 def _find_topic(reader: BagReader, name: str, kind: str, image_topic: str) -> str:
     named = [t.name for t in reader.topics if t.type == kind and topic_matches(name, t.name)]
-    beside = f"{image_topic.rpartition('/')[0]}/{name}"
-    if beside in named:
-        return beside
+    sibling = f"{image_topic.rpartition('/')[0]}/{name}"
+    if sibling in named:
+        return sibling
     return named[0] if len(named) == 1 else ""
 
 

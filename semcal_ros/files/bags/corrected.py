@@ -36,8 +36,6 @@ from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFrame
 
-__all__ = ["CorrectedBagWriter"]
-
 _TOPICS = {
     "image_rect": "sensor_msgs/msg/Image",
     "camera_info": "sensor_msgs/msg/CameraInfo",

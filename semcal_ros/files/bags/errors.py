@@ -35,7 +35,6 @@ if sys.version_info >= (3, 14):
 else:
     from backports.zstd import ZstdError
 
-__all__ = ["LIBRARY_ERRORS", "check_types", "one_line", "reading", "unreadable"]
 
 # Damaged bytes surface from the parsers as errors of many kinds: lengths that overflow, unknown
 # keys, failed internal checks. The lz4 backend raises plain RuntimeError. These errors are only ever

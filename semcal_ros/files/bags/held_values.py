@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a topic of a recording said last before a given moment."""
+"""What a topic of a recording said last before a given moment, such as the magnification of an image."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.bags.reader import BagReader, RawMessage
-
-__all__ = ["HeldValues"]
 
 T = TypeVar("T")
 
@@ -92,3 +92,21 @@ class HeldValues(Generic[T]):
     def held_during(self, start_ns: int, end_ns: int) -> list[T | None]:
         """Return all values of an interval, the one at its start first."""
         return [self._hold.at(start_ns), *self._hold.between(start_ns, end_ns)]
+
+
+class MagnificationTrack(HeldValues[MagnificationReading]):
+    """All magnification messages of a topic, each valid until the next one."""
+
+    def __init__(self, reader: BagReader, topic: str, config: MicroscopeConfig) -> None:
+        super().__init__(reader, topic, lambda message: read_magnification(message, config))
+
+    def at(self, stamp_ns: int, log_time_ns: int, image_width_px: int) -> float | None:
+        """Return the magnification at an image, or None before the first message and after a bad one.
+
+        Raises
+        ------
+        MessageError
+            A pixel size gives no credible magnification for an image of this width.
+        """
+        reading = self.held_at(stamp_ns, log_time_ns)
+        return None if reading is None else float(reading.magnification(image_width_px))

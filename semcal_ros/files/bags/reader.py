@@ -51,14 +51,6 @@ from semcal_ros.text_files import name_similar_file, read_text_file
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = [
-    "BagMessage",
-    "BagReader",
-    "BagTopic",
-    "RawMessage",
-    "is_bag",
-    "open_bag",
-]
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _ACCEPTED = "a rosbag2 folder with metadata.yaml, or one .mcap or .db3 file"
@@ -356,9 +348,9 @@ def _find_typestore(connection: Connection, path: Path) -> Typestore:
     known = connection.msgtype in jazzy.fielddefs
     if known and connection.digest and connection.digest == jazzy.hash_rihs01(connection.msgtype):
         return jazzy
-    own = _own_types(connection)
-    _check_arrays(own, f"{connection.msgtype} on {connection.topic} in {path}")
-    if not own:
+    defined = _defined_types(connection)
+    _check_arrays(defined, f"{connection.msgtype} on {connection.topic} in {path}")
+    if not defined:
         if known:
             return jazzy
         raise BagError(
@@ -366,14 +358,16 @@ def _find_typestore(connection: Connection, path: Path) -> Typestore:
             expected="a common ROS 2 type, or its definition inside the recording",
             do="record with mcap, which stores definitions",
         )
-    if all(name in jazzy.fielddefs and jazzy.fielddefs[name][1] == own[name][1] for name in own):
+    if all(
+        name in jazzy.fielddefs and jazzy.fielddefs[name][1] == defined[name][1] for name in defined
+    ):
         return jazzy
     store = get_typestore(Stores.EMPTY)
-    store.register(own)
+    store.register(defined)
     return store
 
 
-def _own_types(connection: Connection) -> dict[str, Any]:
+def _defined_types(connection: Connection) -> dict[str, Any]:
     text = connection.msgdef.data
     if connection.msgdef.format == MessageDefinitionFormat.MSG:
         return dict(get_types_from_msg(text, connection.msgtype))

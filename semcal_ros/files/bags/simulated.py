@@ -31,8 +31,6 @@ from semcal_ros.config.config import STAGE_TYPE
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 
-__all__ = ["SIMULATED_START_NS", "write_simulated"]
-
 SIMULATED_START_NS = 1_700_000_000_000_000_000
 """Stamp of time zero, ns: arbitrary but fixed, which keeps recordings of one seed identical."""
 
@@ -101,10 +99,10 @@ def write_simulated(
         for frame, pixels in zip(frames, images, strict=True):
             stamp_ns = SIMULATED_START_NS + round(frame.start_time_s * 1e9)
             if conditions and magnification is None:
-                told = blank_message(CONDITIONS_TYPE)
-                fill_conditions(told, conditions, "virtual SEM")
+                message = blank_message(CONDITIONS_TYPE)
+                fill_conditions(message, conditions, "virtual SEM")
                 writer.add_topic("/sem/conditions", CONDITIONS_TYPE, latched=True, depth=1)
-                writer.write("/sem/conditions", stamp_ns - _LEAD_NS, told)
+                writer.write("/sem/conditions", stamp_ns - _LEAD_NS, message)
             if frame.magnification != magnification:
                 magnification = frame.magnification
                 value = blank_message("std_msgs/msg/Float64")

@@ -33,8 +33,6 @@ from semcal_ros.files.bags.held_values import HeldValues
 from semcal_ros.files.bags.reader import BagReader, BagTopic
 from semcal_ros.files.bags.topics import topic_matches
 
-__all__ = ["StageTrack", "find_stage"]
-
 _UNUSED = "the stage is not used"
 
 
@@ -167,8 +165,8 @@ def _find_topic(
 ) -> tuple[BagTopic | None, str]:
     named = [t for t in topics if t.count and topic_matches(source.topic, t.name)]
     fitting = [t for t in named if t.type == source.type]
-    beside = f"{image_topic.rpartition('/')[0]}/{source.topic}"
-    fitting = [t for t in fitting if t.name == beside] or fitting
+    sibling = f"{image_topic.rpartition('/')[0]}/{source.topic}"
+    fitting = [t for t in fitting if t.name == sibling] or fitting
     if len(fitting) == 1:
         return fitting[0], ""
     if fitting:

@@ -23,8 +23,6 @@ from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageCon
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.reader import BagTopic
 
-__all__ = ["find_image_topic", "find_topic", "topic_matches"]
-
 _MAX_LISTED = 8  # topics in one line of an error
 
 

@@ -30,8 +30,8 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
-from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.files.bags.microscope_messages import (
+from semcal_ros.files.bags.messages import (
+    blank_message,
     check_recordable,
     conditions_message,
     magnification_message,
@@ -43,8 +43,6 @@ from semcal_ros.files.tiff.sem_image import Conditions
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-__all__ = ["ViewRecorder"]
 
 
 class ViewRecorder:
@@ -67,7 +65,7 @@ class ViewRecorder:
         check_recordable(config)
         self._config = config
         self._writer = BagWriter(path)
-        self._told: dict[str, dict[str, float | str] | StageReading | float] = {}
+        self._written: dict[str, dict[str, float | str] | StageReading | float] = {}
         self._last_ns = -1
 
     @property
@@ -124,8 +122,8 @@ class ViewRecorder:
             joints = stage_message(config.stage, stage, changed_ns)
             self._write(config.stage.topic, changed_ns, joints, config.stage.type)
         if self._is_news("conditions", conditions.topic_values()):
-            told = conditions_message(conditions, config.name)
-            self._write(CONDITIONS_TOPIC, changed_ns, told, CONDITIONS_TYPE)
+            stated = conditions_message(conditions, config.name)
+            self._write(CONDITIONS_TOPIC, changed_ns, stated, CONDITIONS_TYPE)
         message, header = blank_message(IMAGE_TYPE), blank_message("std_msgs/msg/Header")
         fill_header(header, stamp_ns, config.frame_id)
         fill_image(message, self._with_databar(image), encoding, header)
@@ -137,8 +135,8 @@ class ViewRecorder:
         return np.concatenate([image, blank]) if rows else image
 
     def _is_news(self, key: str, value: Any) -> bool:
-        news = bool(self._told.get(key) != value)
-        self._told[key] = value
+        news = bool(self._written.get(key) != value)
+        self._written[key] = value
         return news
 
     def _write(self, topic: str, time_ns: int, message: Any, kind: str) -> None:

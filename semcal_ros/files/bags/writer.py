@@ -43,7 +43,6 @@ from semcal_ros.files.bags.messages import jazzy_types, message_type_name, seria
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["BagWriter", "check_replaceable"]
 
 _METADATA_VERSION: Final = 9  # what Jazzy and Kilted write
 _NO_LIMIT = QosTime(9223372036, 854775807)  # how DDS spells an infinite duration

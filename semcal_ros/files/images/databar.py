@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import without_databar
 
-__all__ = ["DatabarCutter", "DatabarFinder", "find_databar"]
-
 # Part of a row that has its commonest value: in bars at least a half, but where text is dense; in pictures of 8 bits at
 # most a third, but where they are clipped.
 _OF_BAR, _OF_BAR_TYPICALLY, _OF_PICTURE = 0.45, 0.6, 0.4
@@ -73,8 +71,8 @@ def find_databar(image: NDArray[Any]) -> int:
     image = _one_channel(image)
     height = len(image)
     most = int(_LARGEST_PART * height)
-    looked = image[height - min(2 * most, height) :]
-    share = np.array([np.bincount(row).max() for row in looked]) / image.shape[1]
+    lowest = image[height - min(2 * most, height) :]
+    share = np.array([np.bincount(row).max() for row in lowest]) / image.shape[1]
     low = np.flatnonzero(share < _OF_BAR)
     rows = len(share) - 1 - int(low[-1]) if len(low) else len(share)
     if not _FEWEST <= rows <= most or np.median(share[-rows:]) < _OF_BAR_TYPICALLY:
@@ -82,8 +80,8 @@ def find_databar(image: NDArray[Any]) -> int:
     above = share[max(0, len(share) - 2 * rows) : len(share) - rows]
     if np.median(above) >= _OF_PICTURE:
         return 0
-    span = float(looked.max()) - float(looked.min())
-    return rows if np.mean(_is_text(looked[-rows:], span)) >= _LEAST_TEXT else 0
+    span = float(lowest.max()) - float(lowest.min())
+    return rows if np.mean(_is_text(lowest[-rows:], span)) >= _LEAST_TEXT else 0
 
 
 class DatabarFinder:

@@ -12,10 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""An image file of any kind, and what it says about each of its images."""
+"""An image file of any kind, and what it says about each of its images.
+
+TIFF files and videos have modules of their own; files of one image (PNG, JPEG, BMP, GIF, WebP) are read here.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,12 +27,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from semcal_ros.core.errors import SemcalError, TiffError
-from semcal_ros.files.images.plain import PLAIN_IMAGES, describe_plain_image, read_plain_image
+from semcal_ros.core.errors import BagError, SemcalError, TiffError
 from semcal_ros.files.images.tiff_stack import list_tiff_stack, read_tiff_stack
-from semcal_ros.files.images.video_frames import VIDEO_SUFFIXES, describe_video, read_video
 from semcal_ros.files.tiff.read import (
     is_tiff,
     read_page_settings,
@@ -36,8 +41,15 @@ from semcal_ros.files.tiff.read import (
     side_file_settings,
 )
 from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.video import VIDEO_SUFFIXES, describe_video, read_video
 
-__all__ = ["ImageFile", "ImagePage", "describe_image_file", "is_image_file"]
+#: Suffixes of these files.
+PLAIN_IMAGES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp"})
+
+# EXIF: the directory of the camera, and in it the time of the exposure.
+_CAMERA, _TAKEN = 0x8769, 0x9003
+# The rows of the sensor, however the camera was held.
+_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 @dataclass(frozen=True)
@@ -209,3 +221,50 @@ def _describe_plain(path: Path) -> ImageFile:
         () if settings is None else settings.notes,
         "" if page.pixel_size_m else why,
     )
+
+
+def describe_plain_image(path: Path) -> tuple[tuple[int, int], datetime | None]:
+    """Return the (width, height) of an image, and when it was taken, where a camera wrote that down.
+
+    Raises
+    ------
+    BagError
+        The file cannot be read, or is no image.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of odd metadata, and of large images
+            with Image.open(path) as image:
+                taken = image.getexif().get_ifd(_CAMERA).get(_TAKEN)
+                size = image.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = getattr(error, "strerror", None)
+        raise BagError(
+            f"{path}: {reason}" if reason else f"{path}: not a readable image",
+            expected="an intact 8 or 16 bit image file",
+        ) from error
+    try:
+        return size, datetime.strptime(str(taken), "%Y:%m:%d %H:%M:%S")  # local time
+    except ValueError:
+        return size, None
+
+
+def read_plain_image(path: Path) -> NDArray[Any]:
+    """Read the grey values of an image file, 8 or 16 bit.
+
+    Raises
+    ------
+    BagError
+        The file cannot be read or decoded, or has another depth.
+    """
+    try:
+        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror or error}", expected="a readable image") from error
+    try:
+        image = cv2.imdecode(data, _AS_STORED) if len(data) else None
+    except cv2.error:
+        image = None  # OpenCV raises for absurd sizes
+    if image is None or image.dtype.name not in ("uint8", "uint16"):
+        raise BagError(f"{path}: not a readable image", expected="an intact 8 or 16 bit image file")
+    return image

@@ -47,17 +47,6 @@ from semcal_ros.files.tiff.same_scan import group_by_scan
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.text_files import name_similar_file
 
-__all__ = [
-    "MIN_SPACING_NS",
-    "ImageSeries",
-    "SeriesImage",
-    "Skipped",
-    "find_image_files",
-    "group_skipped",
-    "list_image_series",
-    "refuse_images",
-]
-
 _SECOND_NS = 1_000_000_000
 _SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
 MIN_SPACING_NS = 1_000_000
@@ -65,7 +54,9 @@ MIN_SPACING_NS = 1_000_000
 # What a maker's file and a user say about a pixel may differ in their last digits.
 _SAME_SCALE = 5e-3
 # Files in which a bar of text is looked for.
-_LOOKED_AT = 3
+_EXAMINED = 3
+# A stage that turns back comes back to a fraction of this, rad.
+_TURNED_RAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -168,8 +159,8 @@ class ImageSeries:
             Those to read, in their order and without gaps in a file; by default all.
         """
         chosen = self.images if images is None else images
-        for _, own in groupby(chosen, key=lambda image: id(image.file)):
-            images = list(own)
+        for _, group in groupby(chosen, key=lambda image: id(image.file)):
+            images = list(group)
             pixels = images[0].file.read()
             for number, image in enumerate(images):
                 try:
@@ -345,10 +336,6 @@ def _in_time(files: Sequence[ImageFile], begins: Sequence[int | None]) -> list[I
     return [files[k] for k in order]
 
 
-# A stage that turns back comes back to a fraction of this, rad.
-_TURNED_RAD = 1e-3
-
-
 def _stages(found: Sequence[_Image]) -> tuple[list[StageReading | None], list[str]]:
     """Return what the files say about the stage, as far as its meaning is known, and notes.
 
@@ -367,11 +354,13 @@ def _stages(found: Sequence[_Image]) -> tuple[list[StageReading | None], list[st
         rotated = abs(settings.scan_rotation_rad or 0.0) > _TURNED_RAD
         scan_rotated += rotated and settings.stage_tilt_rad is not None
         usable = settings.stage_tilt_rad is not None and not rotated
-        own = StageReading(settings.stage_tilt_rad, None if turned else turn) if usable else None
-        if own is not None and (doubt := doubt_unit(own, StageConfig())):
+        reading = (
+            StageReading(settings.stage_tilt_rad, None if turned else turn) if usable else None
+        )
+        if reading is not None and (doubt := doubt_unit(reading, StageConfig())):
             doubts.setdefault(doubt, []).append(item.file.path.name)
-            own = None
-        readings.append(own)
+            reading = None
+        readings.append(reading)
     notes = [
         f"the stage of {_some(names, 'image')} is not used: {doubt}"
         for doubt, names in doubts.items()
@@ -398,7 +387,7 @@ def _one_detector(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[str
     """Files without those of further detectors that saw the same scan, and a note about them."""
     known = [file for file in files if file.pages[0].settings is not None]
     first = [(file.pages[0].settings, file.pages[0].size_px) for file in known]
-    groups = group_by_scan([(own, size) for own, size in first if own is not None])
+    groups = group_by_scan([(settings, size) for settings, size in first if settings is not None])
     shared = [[known[k] for k in group] for group in groups if len(group) > 1]
     if not shared:
         return list(files), []
@@ -502,9 +491,9 @@ def _cut_databars(
     # The first one of a file, since others of it may be far into a video.
     firsts = {id(image.file): image for image in reversed(images)}
     untold = [image for image in firsts.values() if image.databar_rows == 0]
-    looked = untold[:: max(1, len(untold) // _LOOKED_AT)][:_LOOKED_AT]
+    examined = untold[:: max(1, len(untold) // _EXAMINED)][:_EXAMINED]
     finders: dict[tuple[int, int], DatabarFinder] = {}
-    stored = ImageSeries(tuple(looked), display_width_m, (), ())
+    stored = ImageSeries(tuple(examined), display_width_m, (), ())
     for image, pixels in stored.read():
         if isinstance(pixels, np.ndarray):
             finders.setdefault(image.page.size_px, DatabarFinder()).look(pixels)

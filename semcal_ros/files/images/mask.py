@@ -25,8 +25,6 @@ import numpy as np
 from semcal_ros.core.arrays import AnyImage, Array32, Mask
 from semcal_ros.core.errors import BagError
 
-__all__ = ["fill_masked", "fit_mask", "read_mask"]
-
 # An image of a hundred million pixels, 8 bits each.
 _MOST_BYTES = 2**27
 

@@ -32,8 +32,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.errors import BagError, InvalidValueError
 
-__all__ = ["DATABAR_ROWS", "OmeTiffWriter", "open_ome_tiff"]
-
 #: Key of the description for the rows at the bottom that are not part of the scan.
 DATABAR_ROWS = "databar_rows"
 

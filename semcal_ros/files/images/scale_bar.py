@@ -28,8 +28,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from semcal_ros.core.arrays import check_positive
 
-__all__ = ["ScaleBar", "add_databar", "choose_scale_bar", "draw_scale_bar", "format_length"]
-
 # So that the label and the pixel size find room beside it.
 _PART_OF_WIDTH = 0.25
 _STEPS = (1.0, 2.0, 5.0)

@@ -36,8 +36,6 @@ from semcal_ros.files.tiff.read import open_tiff
 from semcal_ros.files.tiff.values import quantity
 from semcal_ros.files.tiff.xml_tag import parse_xml
 
-__all__ = ["TiffStack", "list_tiff_stack", "read_tiff_stack"]
-
 _MAX_PAGES = 100_000
 _MAX_BYTES = 8
 _GREY = ("minisblack", "miniswhite", "rgb", "palette", "ycbcr")
@@ -176,7 +174,7 @@ def _read_ome(path: Path, text: str, count: int) -> _Description:
     if len(times) != count or any(b <= a for a, b in pairwise(times)):
         times = tuple(k * interval for k in range(count)) if interval else ()
     size = _attribute(pixels, "PhysicalSizeX", "m", "um")
-    taken, rows = _read_own(_first(root, "Description"))
+    taken, rows = _read_description(_first(root, "Description"))
     return _Description(size or None, times or None, taken, rows)
 
 
@@ -184,7 +182,7 @@ def _first(root: ElementTree.Element, name: str) -> ElementTree.Element | None:
     return next((item for item in root.iter() if item.tag.rpartition("}")[2] == name), None)
 
 
-def _read_own(description: ElementTree.Element | None) -> tuple[datetime | None, int]:
+def _read_description(description: ElementTree.Element | None) -> tuple[datetime | None, int]:
     """The time and the rows of a databar that this package wrote; None and 0 where it did not."""
     try:
         said = json.loads((description is not None and description.text) or "")

@@ -37,8 +37,8 @@ from semcal_ros.config.config import (
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
-from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.files.bags.microscope_messages import (
+from semcal_ros.files.bags.messages import (
+    blank_message,
     check_recordable,
     conditions_message,
     magnification_message,
@@ -55,8 +55,6 @@ from semcal_ros.files.images.image_series import (
 )
 from semcal_ros.files.recordings import ENCODINGS, RecordedFiles, open_image_series
 from semcal_ros.files.tiff.sem_image import Conditions, SemImage
-
-__all__ = ["METADATA_TOPIC", "SIDECAR", "ImportSummary", "import_images"]
 
 METADATA_TOPIC = "metadata"
 """Topic with the settings of each image as JSON text (std_msgs/String)."""
@@ -158,7 +156,7 @@ def _write_all(
     on_progress: Callable[[int, int], object] | None,
 ) -> tuple[list[dict[str, Any]], list[Skipped]]:
     written, skipped = [], []
-    told: dict[str, float | str] = {}
+    written_conditions: dict[str, float | str] = {}
     stage = config.stage if any(image.stage is not None for image in series.images) else None
     for number, (image, pixels) in enumerate(series.read(), 1):
         if on_progress is not None:
@@ -167,8 +165,8 @@ def _write_all(
             skipped.append(Skipped(image.name, str(pixels)))
             continue
         conditions = image.conditions or Conditions()
-        if conditions.topic_values() != told:
-            told = conditions.topic_values()
+        if conditions.topic_values() != written_conditions:
+            written_conditions = conditions.topic_values()
             before_ns = max(0, image.stamp_ns - _BEFORE_IMAGE_NS)
             topic = microscope_topic(CONDITIONS_TOPIC)
             writer.add_topic(topic, CONDITIONS_TYPE, latched=True, depth=1)

@@ -35,18 +35,6 @@ from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.images.ome_tiff import DATABAR_ROWS, OmeTiffWriter, open_ome_tiff
 from semcal_ros.files.images.scale_bar import add_databar, choose_scale_bar
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "TIFF_SUFFIXES",
-    "FolderWriter",
-    "PixelScale",
-    "TiffStackWriter",
-    "open_image_folder",
-    "open_tiff_stack",
-    "pixel_scale",
-    "write_image",
-]
-
 TIFF_SUFFIXES = (".tif", ".tiff")
 IMAGE_SUFFIXES = (*TIFF_SUFFIXES, ".png")
 _NO_NOTES: Mapping[str, object] = MappingProxyType({})

@@ -36,8 +36,6 @@ from semcal_ros.files.tiff.values import (
     quantity,
 )
 
-__all__ = ["USUAL_DISPLAY_WIDTH_M", "hitachi_pairs", "hitachi_settings"]
-
 USUAL_DISPLAY_WIDTH_M = 0.127
 """Width of the photograph (5 x 4 inches) to which Hitachi's magnification refers."""
 

@@ -39,8 +39,6 @@ from semcal_ros.files.tiff.values import (
     quantity,
 )
 
-__all__ = ["imagej_channels", "imagej_entries", "imagej_images", "imagej_info", "imagej_settings"]
-
 # ImageJ's private TIFF tag, IJMetadata.
 _TAG = 50839
 _UNITS = {"micron": "um", "microns": "um", "nanometer": "nm", "millimeter": "mm", "meter": "m"}

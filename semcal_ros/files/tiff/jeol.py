@@ -34,8 +34,6 @@ from semcal_ros.files.tiff.values import (
     quantity,
 )
 
-__all__ = ["USUAL_DISPLAY_WIDTH_M", "jeol_pairs", "jeol_settings"]
-
 USUAL_DISPLAY_WIDTH_M = 0.128
 """Width of the photograph to which JEOL's magnification usually refers.
 

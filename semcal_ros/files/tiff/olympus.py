@@ -33,8 +33,6 @@ from semcal_ros.files.tiff.values import (
     positive,
 )
 
-__all__ = ["TAG", "olympus_settings"]
-
 # OlympusSIS.
 TAG = 33560
 

@@ -27,8 +27,6 @@ from semcal_ros.files.tiff.sem_image import VendorSettings
 from semcal_ros.files.tiff.values import check_pixel_size, positive
 from semcal_ros.files.tiff.xml_tag import date_of, number_of, quantity_of, text_of
 
-__all__ = ["ROOT", "phenom_settings"]
-
 ROOT = "FeiImage"
 
 

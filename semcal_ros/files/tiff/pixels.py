@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.codec_headers import MAX_PIXELS as MAX_MESSAGE_PIXELS
 from semcal_ros.core.errors import TiffError
 
-__all__ = ["MAX_PIXELS", "MAX_SIDE_PX", "check_directories", "grey_image", "page_size"]
-
 # These limits bound the memory that a damaged header can request.
 MAX_SIDE_PX = 65_536
 # Twice the largest image of a message, 1 GiB at 16 bits: the largest frame may have a data bar below

@@ -49,17 +49,7 @@ from semcal_ros.files.tiff.imagej import (
 )
 from semcal_ros.files.tiff.pixels import check_directories, grey_image, page_size
 from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
-from semcal_ros.files.tiff.side_file import decode_text, find_side_file, read_side_file
-
-__all__ = [
-    "is_tiff",
-    "open_tiff",
-    "read_page_settings",
-    "read_sem_pages",
-    "read_sem_settings",
-    "read_sem_tiff",
-    "side_file_settings",
-]
+from semcal_ros.files.tiff.values import decode_text, find_side_file, read_side_file
 
 SUFFIXES = (".tif", ".tiff")
 # Bounds what a damaged chain of directories can request; a series of this length fills a day at 1 Hz.
@@ -279,12 +269,14 @@ def _list_pages(
         if index and int(page.subfiletype) & _REDUCED:
             continue
         size_px = page_size(path, page)
-        own = _tag_settings(path, page, size_px) if index else _settings(path, page, size_px)
-        if own is None:
+        settings = _tag_settings(path, page, size_px) if index else _settings(path, page, size_px)
+        if settings is None:
             _check_size_of_first(path, index, size_px, listed[0][2])
-            own = listed[0][1]
-        listed.append((page, own, size_px))
-    return [(page, _of_channel(own, first, page.index), size) for page, own, size in listed]
+            settings = listed[0][1]
+        listed.append((page, settings, size_px))
+    return [
+        (page, _of_channel(settings, first, page.index), size) for page, settings, size in listed
+    ]
 
 
 def _check_size_of_first(
@@ -348,7 +340,7 @@ def read_page_settings(
         directories = check_directories(path, pages=_MAX_PAGES)
         with tifffile.TiffFile(path) as file:
             listed = _list_pages(file, path, directories)
-    return tuple((page.index, own, size_px) for page, own, size_px in listed)
+    return tuple((page.index, settings, size_px) for page, settings, size_px in listed)
 
 
 def read_sem_pages(path: str | Path, *, databar_rows: int | None = None) -> Iterator[SemImage]:
@@ -385,11 +377,11 @@ def read_sem_tiff(path: str | Path, *, databar_rows: int | None = None, page: in
     """
     path = Path(path)
     with open_tiff(path, pages=page + 1) as file:
-        own, first = _page(file, path, page), _page(file, path, 0)
-        size_px = page_size(path, own)
-        settings = _tag_settings(path, own, size_px) if page else None
+        listed, first = _page(file, path, page), _page(file, path, 0)
+        size_px = page_size(path, listed)
+        settings = _tag_settings(path, listed, size_px) if page else None
         if settings is None:
             first_px = page_size(path, first)
             _check_size_of_first(path, page, size_px, first_px)
             settings = _settings(path, first, first_px)
-        return _sem_image(path, own, _of_channel(settings, first, page), databar_rows)
+        return _sem_image(path, listed, _of_channel(settings, first, page), databar_rows)

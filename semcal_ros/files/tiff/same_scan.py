@@ -20,8 +20,6 @@ from collections.abc import Sequence
 
 from semcal_ros.files.tiff.sem_image import VendorSettings
 
-__all__ = ["group_by_scan"]
-
 _STAMP_S = 1.0  # makers give whole seconds
 
 

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.conditions import NUMBERS, TEXTS
 from semcal_ros.core.camera.conditions import FILE_NAMES
 
-__all__ = ["Conditions", "SemImage", "VendorSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:

@@ -26,16 +26,14 @@ from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.side_file import decode_text
 from semcal_ros.files.tiff.values import (
     check_pixel_size,
+    decode_text,
     first_date,
     plain_number,
     positive,
     tilt_correction_note,
 )
-
-__all__ = ["TAG", "tescan_pairs", "tescan_settings"]
 
 # TESCAN's private TIFF tag.
 TAG = 50431

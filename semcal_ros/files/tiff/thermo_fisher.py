@@ -39,18 +39,13 @@ from semcal_ros.files.tiff.values import (
 )
 from semcal_ros.files.tiff.xml_tag import date_of, number_of, quantity_of, text_of
 
-__all__ = [
-    "ROOT",
-    "TAGS",
-    "thermo_fisher_sections",
-    "thermo_fisher_settings",
-    "thermo_fisher_xml_settings",
-]
-
 # Private TIFF tags of FEI, now Thermo Fisher: FEI_HELIOS and FEI_SFEG.
 TAGS = (34682, 34680)
 ROOT = "Metadata"
 _BEAMS = {"EBeam": "electron", "IBeam": "ion", "Electron": "electron", "Ion": "ion"}
+# Width of the picture for which the XL series states a magnification, m, where a file does not say it: the longer
+# side of a Polaroid picture.
+_XL_WIDTH_M = 0.1133
 
 
 def thermo_fisher_sections(text: str) -> dict[str, dict[str, str]]:
@@ -124,11 +119,6 @@ def _check_is_a_scan(
             expected="an image of the specimen",
             do="take the image without the channeling pattern mode",
         )
-
-
-# Width of the picture for which the XL series states a magnification, m, where a file does not say it: the longer
-# side of a Polaroid picture.
-_XL_WIDTH_M = 0.1133
 
 
 def _xl_settings(path: Path, tag: Mapping[str, Any], size_px: tuple[int, int]) -> VendorSettings:

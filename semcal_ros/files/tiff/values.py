@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Numbers with units, and dates, in the formats of microscopes' metadata."""
+"""Metadata as text: numbers with units, dates, and the files next to an image in which some makers keep them."""
 
 from __future__ import annotations
 
@@ -22,21 +22,6 @@ from datetime import datetime
 from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
-
-__all__ = [
-    "PIXEL_SIZE_RANGE_M",
-    "angle_in_degrees",
-    "aspect_notes",
-    "check_pixel_size",
-    "duration",
-    "first_date",
-    "is_credible_year",
-    "plain_number",
-    "positive",
-    "quantity",
-    "rounding",
-    "tilt_correction_note",
-]
 
 # A tenth of a picometre lies far below the size of an atom, a millimetre above any field of an SEM
 # divided by its columns: what lies outside has lost its unit.
@@ -48,6 +33,7 @@ _YEARS = (1971, 2037)  # what the 32-bit seconds of a ROS stamp hold
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _DURATIONS_S = {"sec": 1.0, "secs": 1.0, "min": 60.0, "mins": 60.0, "hour": 3600.0, "hours": 3600.0}
 _PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
+_MAX_BYTES = 1_000_000  # the text files have a few kB
 
 
 def _split(text: object) -> tuple[float, str] | None:
@@ -185,3 +171,25 @@ def tilt_correction_note(angle_rad: float | None) -> str:
         f"tilt correction was on{angle}: the rows are spaced for a surface tilted so, and a surface at another "
         "angle is stretched along y"
     )
+
+
+def decode_text(data: bytes) -> str:
+    """Decode UTF-16 with its mark, UTF-8, or else Latin-1, in which the micro sign of older programs is."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", errors="replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def find_side_file(image: Path, endings: tuple[str, ...]) -> Path | None:
+    """The file beside ``image`` whose name is its stem and one of the endings, in either case."""
+    names = [image.stem + form for ending in endings for form in (ending, ending.upper())]
+    return next((image.parent / name for name in names if (image.parent / name).is_file()), None)
+
+
+def read_side_file(path: Path) -> bytes:
+    """The contents of a text file, cut off far beyond the size that makers' files have."""
+    with path.open("rb") as file:
+        return file.read(_MAX_BYTES)

@@ -24,8 +24,6 @@ from xml.etree import ElementTree
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.values import first_date, plain_number, quantity
 
-__all__ = ["TAG", "date_of", "number_of", "parse_xml", "quantity_of", "text_of"]
-
 # Private TIFF tag of FEI, FEI_TITAN.
 TAG = 34683
 _MAX_CHARS = 1_000_000  # real ones have some 10 kB

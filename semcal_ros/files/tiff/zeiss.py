@@ -49,8 +49,6 @@ from semcal_ros.files.tiff.values import (
     tilt_correction_note,
 )
 
-__all__ = ["TAG", "zeiss_entries", "zeiss_settings"]
-
 # Private TIFF tag of Zeiss, CZ_SEM.
 TAG = 34118
 # The unnamed numbers at the head of the tag repeat some settings with more digits.

@@ -130,16 +130,16 @@ class Endpoints:
 
         A remap of ``topic`` itself counts more.
         """
-        own = self._node.resolve_topic_name(topic)
-        if own != self._node.resolve_topic_name(topic, only_expand=True):
-            return own
+        resolved = self._node.resolve_topic_name(topic)
+        if resolved != self._node.resolve_topic_name(topic, only_expand=True):
+            return resolved
         return f"{self._node.resolve_topic_name(neighbour).rpartition('/')[0]}/{topic}"
 
     def below(self, topic: str, name: str) -> str:
         """Return the full name ``<topic>/<name>``, where ``topic`` may have been remapped."""
-        own = f"{topic}/{name}"
-        resolved = self._node.resolve_topic_name(own)
-        if resolved != self._node.resolve_topic_name(own, only_expand=True):
+        named = f"{topic}/{name}"
+        resolved = self._node.resolve_topic_name(named)
+        if resolved != self._node.resolve_topic_name(named, only_expand=True):
             return resolved
         return f"{self._node.resolve_topic_name(topic)}/{name}"
 

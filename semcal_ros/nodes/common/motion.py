@@ -213,7 +213,7 @@ class MotionInterface:
         command: str,
         asked: str,
         check: Callable[[], None],
-        look: Callable[[], None],
+        check_way: Callable[[], None],
         act: Callable[[], None],
     ) -> None:
         """Check a command and let it be done.
@@ -242,7 +242,7 @@ class MotionInterface:
 
         def work() -> str:
             nonlocal acting
-            look()
+            check_way()
             if dry:
                 return f"would be done: {asked}"
             acting = True

@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Quality of service of the suite's topics (design section 9). Users override it by `qos_overrides` parameters."""
+"""Quality of service of the suite's topics, as ``doc/nodes.md``, "Quality of service", states it.
+
+Users override it by ``qos_overrides`` parameters.
+"""
 
 from __future__ import annotations
 

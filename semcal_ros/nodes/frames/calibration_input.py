@@ -242,7 +242,7 @@ class CalibrationInput:
         # Two latched publishers may answer a late joiner in any order.
         return self._loaded is not None and since_ns < self._loaded.since_ns
 
-    def _is_own(self, text: str, since_ns: int) -> bool:
+    def _is_from_here(self, text: str, since_ns: int) -> bool:
         # A node that republishes what it takes over must not take over its own messages: with two calibrations
         # in transit it would publish them in turns for ever.
         return any(
@@ -264,7 +264,7 @@ class CalibrationInput:
         except SemcalError as error:
             self._reporter.reject(error)
             return
-        if self._is_older(since_ns) or self._is_own(text, since_ns):
+        if self._is_older(since_ns) or self._is_from_here(text, since_ns):
             return
         if not self._is_same(text, since_ns):
             self._parser.submit(_Arrived(since_ns, text))

@@ -73,7 +73,7 @@ class _Seen:
     reason: str = ""
 
 
-def _look(glimpse: _Glimpse) -> _Seen:
+def _examine(glimpse: _Glimpse) -> _Seen:
     try:
         detection = find_lattice(glimpse.image)
         if isinstance(detection, Rejection):
@@ -120,8 +120,8 @@ class CalibrationMonitor:
         self._next_s = time.monotonic()
         self._number = 0
         self._bad: list[str] = []
-        self._told: tuple[Calibration | None, bool] = (None, False)
-        self._worker = LatestWorker(endpoints.guard, _look, self._on_seen)
+        self._reported: tuple[Calibration | None, bool] = (None, False)
+        self._worker = LatestWorker(endpoints.guard, _examine, self._on_seen)
         self._type = message_class(config.image.type)
         self._subscription = endpoints.subscribe(
             self._type, config.image.topic, self._on_bytes, glimpse_input(), raw=True
@@ -156,8 +156,8 @@ class CalibrationMonitor:
         current, _ = self._calibration()
         if seen.calibration is not current:
             return
-        if self._told[0] is not current:
-            self._told, self._bad = (current, False), []
+        if self._reported[0] is not current:
+            self._reported, self._bad = (current, False), []
         if seen.result is None:
             # What was found before still holds: the specimen is another one now.
             self._reporter.note("monitor", seen.reason)
@@ -169,14 +169,14 @@ class CalibrationMonitor:
         else:
             self._bad.append(summary)
         doubtful = len(self._bad) >= _IN_A_ROW
-        if doubtful and not self._told[1]:
+        if doubtful and not self._reported[1]:
             self._reporter.warn(f"the calibration may not hold any more: {summary}")
-        elif self._told[1] and not doubtful:
+        elif self._reported[1] and not doubtful:
             self._reporter.info(f"the calibration holds: {summary}")
-        self._told = current, doubtful
+        self._reported = current, doubtful
 
     def conditions(self) -> list[str]:
         """Return what the diagnostics should say: a calibration that does not hold any more."""
         current, _ = self._calibration()
-        doubtful = self._told[0] is current and self._told[1]
+        doubtful = self._reported[0] is current and self._reported[1]
         return [f"calibration {self._bad[-1]}"] if doubtful else []

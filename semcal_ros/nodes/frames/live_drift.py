@@ -147,7 +147,7 @@ class LiveDrift:
         self._reporter = reporter
         self._load = LoadMonitor()
         self._failed = 0
-        self._beside = DriftProcess()
+        self._process = DriftProcess()
         for setting in (*_RESTARTING, _DETAIL):
             parameters.on_change(setting.name, lambda _value: self.reset())
         self.reset()
@@ -168,7 +168,7 @@ class LiveDrift:
                 max_jump=values["max_jump"],
             )
         )
-        self._is_beside = False
+        self._is_in_process = False
         self._binned = 1
         self._origin_ns: int | None = None
         self._latest: Measurement | None = None
@@ -177,7 +177,7 @@ class LiveDrift:
 
     def close(self) -> None:
         """Stop what runs beside the stream."""
-        self._beside.close()
+        self._process.close()
 
     def estimate(self, frame: StreamFrame, camera: ScanCamera) -> FrameDrift:
         """Estimate the drift at a frame; raises as :meth:`DriftTracker.update`."""
@@ -194,11 +194,11 @@ class LiveDrift:
             self._fetch()
             time_s, centre_s = self._times(frame)
             self._keep(measure_frame(self._tracker, *self._bin(frame, camera), time_s, scan))
-        elif self._beside_is_free():
-            tracker = None if self._is_beside else self._tracker
-            self._is_beside = True
+        elif self._process_is_free():
+            tracker = None if self._is_in_process else self._tracker
+            self._is_in_process = True
             small = self._bin(frame, camera)
-            self._at_work = self._beside.measure(tracker, *small, time_s, scan)
+            self._at_work = self._process.measure(tracker, *small, time_s, scan)
         assert self._latest is not None
         return _estimate_at(self._latest, centre_s, self._binned)
 
@@ -209,9 +209,9 @@ class LiveDrift:
         self._binned = frame.image.shape[1] // small.shape[1]
         return small, fitted
 
-    def _beside_is_free(self) -> bool:
+    def _process_is_free(self) -> bool:
         rested = self._at_work is None and time.monotonic() >= self._rest_until_s
-        return rested and self._beside.is_ready()
+        return rested and self._process.is_ready()
 
     def _is_far(self, centre_s: float) -> bool:
         """Return whether a forecast would span a clock jump or a pause, which the filter does not model."""
@@ -250,11 +250,11 @@ class LiveDrift:
 
     def _fetch(self) -> None:
         """Get the tracker back into this process."""
-        if not self._is_beside:
+        if not self._is_in_process:
             return
         try:
-            self._tracker = self._beside.fetch().result()
-            self._is_beside = False
+            self._tracker = self._process.fetch().result()
+            self._is_in_process = False
         except ChildProcessEnded as error:
             self._complain(f"the process that measures it {error}")
             self.reset()

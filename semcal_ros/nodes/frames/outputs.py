@@ -137,7 +137,7 @@ class RectifiedOutput:
         self._reporter = reporter
         self._databar_rows = 0
         self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
-        beside, own = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
+        sibling, below = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
         matrix = "projection_stamped"
         covariance = "projection_covariance_stamped"
         raw = config.image.topic
@@ -147,10 +147,10 @@ class RectifiedOutput:
         raw_info = _CameraOutput(CameraInfo(), self._fill_raw)
         # These take microseconds and are latched: a subscriber that comes after the last frame gets its camera.
         self._always = (
-            (endpoints.camera_publisher(CameraInfo, "camera_info", beside), info),
+            (endpoints.camera_publisher(CameraInfo, "camera_info", sibling), info),
             (
                 endpoints.camera_publisher(
-                    CameraInfo, own, endpoints.below("image_rect", "camera_info")
+                    CameraInfo, below, endpoints.below("image_rect", "camera_info")
                 ),
                 info,
             ),

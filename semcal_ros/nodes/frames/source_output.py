@@ -96,8 +96,8 @@ class SourceOutput:
         if stage and config.stage is not None:
             self._joints = endpoints.latched_publisher(JointState, config.stage.topic)
         self._number: float | None = None
-        self._told_conditions: Mapping[str, float | str] | None = None
-        self._told_stage: dict[str, float] | None = None
+        self._published_conditions: Mapping[str, float | str] | None = None
+        self._published_stage: dict[str, float] | None = None
         self._image = Image()
 
     @property
@@ -195,20 +195,22 @@ class SourceOutput:
         source = self._config.stage
         if self._joints is None or source is None:
             return
-        told = {getattr(source, joint): float(stage[joint]) for joint in JOINTS if joint in stage}
-        if told == self._told_stage or (not told and self._told_stage is None):
+        joints = {getattr(source, joint): float(stage[joint]) for joint in JOINTS if joint in stage}
+        if joints == self._published_stage or (not joints and self._published_stage is None):
             return
-        self._told_stage = told
-        message = JointState(name=list(told), position=list(told.values()))
+        self._published_stage = joints
+        message = JointState(name=list(joints), position=list(joints.values()))
         fill_header(message.header, stamp_ns, "")
         self._joints.publish(message)
         self._reporter.note("stage_tilt_rad", stage.get("tilt", "unknown"))
 
     def publish_conditions(self, conditions: Mapping[str, float | str]) -> None:
         """Publish how the frames are taken, if that has changed."""
-        if conditions == self._told_conditions or not (conditions or self._told_conditions):
+        if conditions == self._published_conditions or not (
+            conditions or self._published_conditions
+        ):
             return
-        self._told_conditions = dict(conditions)
+        self._published_conditions = dict(conditions)
         message = DiagnosticStatus()
         fill_conditions(message, conditions, self._config.name)
         self._conditions.publish(message)

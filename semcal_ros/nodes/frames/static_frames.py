@@ -45,7 +45,7 @@ class StaticFramesOutput:
     def __init__(self, config: MicroscopeConfig, endpoints: Endpoints, clock: Clock) -> None:
         self._config = config
         self._clock = clock
-        self._told: tuple[StaticFrame, ...] = ()
+        self._published: tuple[StaticFrame, ...] = ()
         self._new_message: Any = None
         try:
             self._new_message = message_class("tf2_msgs/msg/TFMessage")
@@ -58,9 +58,9 @@ class StaticFramesOutput:
     def publish(self, camera: ScanCamera | None) -> None:
         """Tell the frames of a camera, if they are others than before."""
         frames = static_frames(self._config, camera)
-        if self._new_message is None or frames == self._told:
+        if self._new_message is None or frames == self._published:
             return
-        self._told = frames
+        self._published = frames
         message = self._new_message()
         fill_static_frames(message, frames, self._clock.now().nanoseconds, TransformStamped)
         self._publisher.publish(message)

@@ -51,7 +51,7 @@ __all__ = [
     "FrameInput",
     "StreamFrame",
     "StreamNode",
-    "describe_darkness",
+    "describe_blank_image",
     "is_late",
     "nominal_camera",
 ]
@@ -64,7 +64,7 @@ nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
 # stream the scheduling of other processes delays images by as much without the node being too slow.
 _LATE_S, _LATE_INTERVALS = 0.04, 1.5
 # How often an image is looked at whether it shows anything, and at how many of its pixels: cheap, and soon enough.
-_LOOK_S, _LOOKED_AT = 0.5, 1 << 14
+_CHECK_S, _CHECKED_PIXELS = 0.5, 1 << 14
 # Grey levels, by bytes per pixel, that the noise of a detector without a beam may reach: of 8 bits two, and as much of
 # the 10 bits or more that fill the lower part of 16.
 _DARKEST = {1: 2, 2: 8}
@@ -117,7 +117,7 @@ class StreamFrame:
         return self.image.shape[1], self.image.shape[0]
 
 
-def describe_darkness(image: AnyImage) -> str:
+def describe_blank_image(image: AnyImage) -> str:
     """Say that an image shows nothing at all; empty if it shows something.
 
     Parameters
@@ -125,7 +125,7 @@ def describe_darkness(image: AnyImage) -> str:
     image
         (h, w) or (h, w, 3) grey levels. Of a large one, a part of the pixels is looked at.
     """
-    step = max(1, math.isqrt(image.shape[0] * image.shape[1] // _LOOKED_AT))
+    step = max(1, math.isqrt(image.shape[0] * image.shape[1] // _CHECKED_PIXELS))
     sample = image[::step, ::step]
     least, greatest = sample.min(), sample.max()
     if least == greatest:
@@ -217,7 +217,7 @@ class FrameInput:
         self._last_interval_s = 0.0
         self._mixed = 0
         self._dark = ""
-        self._looked_s = -_LOOK_S
+        self._checked_s = -_CHECK_S
 
     def _on_images(self, message: Any, info: MessageInfo) -> None:
         """Process the images that have arrived, oldest first, but skip late ones if there are newer ones.
@@ -279,7 +279,7 @@ class FrameInput:
         pixels, encoding = decoded_image(message)
         image = self._without_databar(pixels)
         # The text of a bar is no light: while it is not known whether there is one, the upper half has none.
-        self._look_for_light(pixels[: (len(pixels) + 1) // 2] if image is None else image)
+        self._check_for_contrast(pixels[: (len(pixels) + 1) // 2] if image is None else image)
         if image is None:
             return None
         stamp_ns = stamp_ns_from_msg(message)
@@ -324,13 +324,13 @@ class FrameInput:
             self._reporter.warn(self._undeclared)
         return image
 
-    def _look_for_light(self, image: AnyImage) -> None:
+    def _check_for_contrast(self, image: AnyImage) -> None:
         """Check now and then whether there is any picture: a blanked beam still gives frames."""
         now_s = time.monotonic()
-        if now_s - self._looked_s < _LOOK_S:
+        if now_s - self._checked_s < _CHECK_S:
             return
-        self._looked_s = now_s
-        before, self._dark = self._dark, describe_darkness(image)
+        self._checked_s = now_s
+        before, self._dark = self._dark, describe_blank_image(image)
         if self._dark and not before:
             self._reporter.warn(f"{self._dark}; check beam blank, shutter and detector")
         elif before and not self._dark:

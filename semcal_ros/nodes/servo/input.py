@@ -199,8 +199,8 @@ class ServoInput:
                 place = parts["drift"].pose.pose.position
                 drift_m = np.array([place.x, place.y])
             k = np.array(parts["info"].k, dtype=np.float64).reshape(3, 3)
-            own = self._stamped.get(stamp_ns)
-            projections = tuple(self._projections) if own is None else (own,)
+            stamped = self._stamped.get(stamp_ns)
+            projections = tuple(self._projections) if stamped is None else (stamped,)
             self._on_frame(
                 ServoFrame(
                     grey,
@@ -209,7 +209,7 @@ class ServoInput:
                     projections,
                     image.header,
                     stamp_ns,
-                    None if own is None else self._covariances.get(stamp_ns),
+                    None if stamped is None else self._covariances.get(stamp_ns),
                 )
             )
         except NODE_ERRORS as error:

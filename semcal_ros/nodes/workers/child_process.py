@@ -69,8 +69,8 @@ class _Pickler(pickle.Pickler):
     """
 
     def reducer_override(self, item: Any) -> Any:
-        own = (getattr(type(item), name) for name in _REDUCERS)
-        if not all(map(is_, own, _REDUCERS.values())) or isinstance(item, type | FunctionType):
+        reducers = (getattr(type(item), name) for name in _REDUCERS)
+        if not all(map(is_, reducers, _REDUCERS.values())) or isinstance(item, type | FunctionType):
             return NotImplemented
         make, arguments, state, *rest = item.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
         # With slots, the attributes are the first of two dictionaries, and the second is a copy already.

@@ -29,8 +29,6 @@ from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, en
 from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.text import format_length, remove_control_characters
 
-__all__ = ["Blink", "choose_blink"]
-
 # Width of the pictures, px: distortions of some pixels are still seen.
 _WIDTH = 640
 _JPEG_QUALITY = 74

@@ -29,17 +29,6 @@ from semcal_ros.report.html.encode import Readings
 from semcal_ros.report.html.style import INK, SECOND
 from semcal_ros.report.html.text import format_magnification
 
-__all__ = [
-    "draw_curve",
-    "mark_magnifications",
-    "parts_by_specimen",
-    "read_curve",
-    "sample_cameras",
-    "sample_cameras_around",
-    "set_limits_with_room",
-]
-
-
 # Points of a curve: closer together than a line of the figure bends.
 _SAMPLES = 81
 
@@ -131,8 +120,10 @@ def draw_curve(
 def read_curve(axes: Axes, g: Array, texts: Sequence[str]) -> Readings:
     """Tell what curves say at every second sample, behind the magnification."""
     step = 2 if len(g) > _SAMPLES // 2 else 1
-    told = [f"{format_magnification(float(x))}: {text}" for x, text in zip(g, texts, strict=True)]
-    return Readings([axes], g[::step], told[::step])
+    readings = [
+        f"{format_magnification(float(x))}: {text}" for x, text in zip(g, texts, strict=True)
+    ]
+    return Readings([axes], g[::step], readings[::step])
 
 
 def set_limits_with_room(axes: Axes, values: Array, half_widths: Array) -> None:

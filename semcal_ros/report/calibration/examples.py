@@ -30,14 +30,6 @@ from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, en
 from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.text import remove_control_characters
 
-__all__ = [
-    "Overlay",
-    "choose_examples",
-    "overlay_corners",
-    "show_rejected",
-]
-
-
 # Width of a thumbnail with marks, px: two fit beside each other in the column of a page.
 _OVERLAY_WIDTH = 320
 # Half the size of a cross, as a part of the corner spacing, within the limits below.

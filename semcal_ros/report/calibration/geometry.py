@@ -26,13 +26,6 @@ from semcal_ros.core.camera.predicted_error import make_field_lattice
 from semcal_ros.core.camera.projection import PARAMETER_NAMES, project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = [
-    "compute_displacements",
-    "compute_rms_without_distortion",
-    "remove_residual_field",
-]
-
-
 # Prior on the change of a pose without distortion, rad: directions that a view does not constrain
 # must not diverge.
 _TURN_RAD = 0.1

@@ -12,7 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tables of a calibration report, in readable units."""
+"""Tables of a calibration report, in readable units.
+
+They are: the calibrated magnifications; the figures of the paper, Malti et al. (2012),
+doi:10.1117/1.JEI.21.3.033020, next to those of the calibration; and the camera with its scale, distortion and
+uncertainty at each step of a slider over the magnification.
+"""
 
 from __future__ import annotations
 
@@ -26,19 +31,19 @@ from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.views import RejectedView
+from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.conditions import describe_condition
+from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.camera.provenance import NOT_RECORDED, Provenance
-from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
-
-__all__ = [
-    "PAPER_RMS_PX",
-    "MagnificationRow",
-    "collect_facts",
-    "collect_warnings",
-    "compute_fitted_inner_px",
-    "compute_held_out_px",
-    "tabulate_magnifications",
-]
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.term_sizes import describe_term_sizes, has_terms, measure_terms
+from semcal_ros.report.calibration.geometry import compute_displacements
+from semcal_ros.report.html.text import (
+    format_length,
+    format_magnification,
+    format_px,
+    remove_control_characters,
+)
 
 # Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: 0.9 in the abstract, 1.45 in section 4.1.3.
 PAPER_RMS_PX = (0.9, 1.45)
@@ -48,6 +53,11 @@ _METHODS = {
     "discrete": "discrete: each magnification on its own, linear in between",
     "pda": "pda: the paper's differential equations through the separate results",
 }
+# Section 4.1.3, medians: after the correction of drift but not of distortion.
+_PAPER_STRAIGHT_PX = 3.0
+# Steps of the slider: a step is less than a tenth of a factor of two over a range of 100.
+_STEPS = 81
+_ACROSS = 9
 
 
 @dataclass(frozen=True)
@@ -71,15 +81,15 @@ def tabulate_magnifications(result: CalibrationResult) -> list[MagnificationRow]
     rms = rms_by_magnification(result.fit)
     rows = []
     for g, value in rms.items():
-        own = [v for v in result.views if v.magnification == g]
+        views = [v for v in result.views if v.magnification == g]
         camera = model.at(g)
         x, y = camera.pixel_size_m
         sigma = (None, None) if camera.covariance is None else camera.pixel_size_sigma_m
         rows.append(
             MagnificationRow(
                 magnification=f"{g:g}×",
-                views=len(own),
-                corners=sum(len(v.image_xy) for v in own),
+                views=len(views),
+                corners=sum(len(v.image_xy) for v in views),
                 rms=_format_error(value, x, y),
                 held_out=_format_error(result.held_out_rms_px.get(g), x, y),
                 extrapolated=g in result.held_out_rms_px and g in model.magnification_range,
@@ -121,7 +131,7 @@ def compute_fitted_inner_px(result: CalibrationResult) -> float | None:
 
 def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
     """Collect what was found about the calibration as sentences, the most costly first."""
-    return [_format_sentence(own.tell(result.model)) for own in find_all(result, rejected)]
+    return [_format_sentence(finding.tell(result.model)) for finding in find_all(result, rejected)]
 
 
 def _format_sentence(text: str) -> str:
@@ -197,3 +207,102 @@ def _collect_fit_facts(fit: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _format_value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """One kind of error, here and in the paper."""
+
+    label: str
+    here: str
+    paper: str
+
+
+def compute_median_px(errors: Mapping[float, float]) -> float | None:
+    """Compute the median over the magnifications, px, or None."""
+    values = [v for v in errors.values() if not np.isnan(v)]
+    return float(np.median(values)) if values else None
+
+
+def tabulate_beside_paper(
+    result: CalibrationResult, rms: Mapping[float, float], straight: Mapping[float, float]
+) -> list[PaperRow]:
+    """Tabulate the errors of a calibration beside those of the paper.
+
+    Parameters
+    ----------
+    rms, straight
+        Error in px at each magnification, with and without correction of the distortion.
+    """
+    abstract, section = PAPER_RMS_PX
+    return [
+        PaperRow(
+            "Distortion left in, median over the magnifications",
+            format_px(compute_median_px(straight)),
+            f"{_PAPER_STRAIGHT_PX:g} px (median, section 4.1.3)",
+        ),
+        PaperRow(
+            "Distortion corrected, median over the magnifications",
+            format_px(compute_median_px(rms)),
+            f"{section:g} px (median, section 4.1.3)",
+        ),
+        PaperRow(
+            "Distortion corrected, all corners",
+            format_px(result.fit.rms_px()),
+            f"{abstract:g} px (abstract and figure 13)",
+        ),
+        PaperRow(
+            "Magnifications left out of the calibration, RMS without the outermost two",
+            format_px(compute_held_out_px(result)),
+            "not reported",
+        ),
+    ]
+
+
+def tabulate_cameras(model: CalibrationModel) -> list[dict[str, Any]]:
+    """Tabulate what the calibration says at magnifications over its range, ready to be shown.
+
+    Each row has the magnification as ``g`` and in ``title``, the matrix ``K`` row by row as texts, and ``values``,
+    pairs of a name and a text. The calibrated magnifications are among the rows, and marked ``calibrated``. A
+    calibration of one magnification has one row.
+    """
+    low, high = model.magnification_range
+    if low == high:
+        return [_row(model.at(low), calibrated=True)]
+    known = {float(g) for g in model.magnifications}
+    steps = sorted({*map(float, np.clip(np.geomspace(low, high, _STEPS), low, high)), *known})
+    return [_row(model.at(g), calibrated=g in known) for g in steps]
+
+
+def _row(camera: ScanCamera, *, calibrated: bool) -> dict[str, Any]:
+    sizes = camera.pixel_size_m
+    sigmas = (None, None) if camera.covariance is None else camera.pixel_size_sigma_m
+    mean_m = float(np.mean(sizes))
+    moved = np.linalg.norm(compute_displacements(camera)[1], axis=1)
+    field = (sizes[0] * camera.width, sizes[1] * camera.height)
+    values = [
+        ("Pixel, x", format_length(sizes[0], sigmas[0])),
+        ("Pixel, y", format_length(sizes[1], sigmas[1])),
+        ("Field", " × ".join(format_length(side) for side in field)),
+        ("Largest distortion", _format_both(float(np.nanmax(moved)), mean_m)),
+    ]
+    if has_terms(camera):
+        values.append(("Largest of each kind", describe_term_sizes(measure_terms(camera))))
+    if camera.covariance is not None:
+        lattice = make_field_lattice(camera.width, camera.height, _ACROSS)
+        predicted = predict_shape_sigma_px(camera, lattice)
+        if np.any(np.isfinite(predicted)):
+            worst = _format_both(float(np.nanmax(predicted)), mean_m)
+            values.append(("Predicted error at the edge, 1-sigma", worst))
+    return {
+        "g": camera.magnification,
+        "title": format_magnification(camera.magnification),
+        "calibrated": calibrated,
+        "K": [[f"{value:.6g}" for value in line] for line in camera.K],
+        "values": values,
+    }
+
+
+def _format_both(px: float, pixel_m: float) -> str:
+    """A displacement in px and as a length."""
+    return f"{px:.2g} px, {format_length(px * pixel_m)}"

@@ -12,17 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The report of a calibration."""
+"""The report of a calibration, with the commands for what its verdict says to do next."""
 
 from __future__ import annotations
 
+import math
 import os
 import re
+import shlex
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib.resources import files
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -30,13 +32,12 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.judgement.plan import judge_calibration
+from semcal_ros.core.calibration.judgement.plan import Verdict, judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.wording import in_nm
+from semcal_ros.core.wording import in_nm, rounded_magnification
 from semcal_ros.report.calibration.blink import choose_blink
-from semcal_ros.report.calibration.camera_table import tabulate_cameras
 from semcal_ros.report.calibration.coverage_figures import (
     plot_coverage,
     plot_reached_shares,
@@ -44,37 +45,35 @@ from semcal_ros.report.calibration.coverage_figures import (
     plot_tilts,
 )
 from semcal_ros.report.calibration.curves import parts_by_specimen
+from semcal_ros.report.calibration.error_figures import (
+    plot_distortion,
+    plot_mean_residuals,
+    plot_residual_field,
+    plot_residual_histogram,
+    plot_residuals,
+    plot_rms,
+)
 from semcal_ros.report.calibration.examples import (
     choose_examples,
     overlay_corners,
     show_rejected,
 )
-from semcal_ros.report.calibration.field_error_figures import (
-    plot_distortion,
-    plot_mean_residuals,
-    plot_residual_field,
-    plot_residuals,
-)
 from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
-from semcal_ros.report.calibration.next_step import suggest_commands
 from semcal_ros.report.calibration.numbers import (
     collect_facts,
     collect_warnings,
     compute_fitted_inner_px,
     compute_held_out_px,
+    tabulate_beside_paper,
+    tabulate_cameras,
     tabulate_magnifications,
 )
-from semcal_ros.report.calibration.paper import tabulate_beside_paper
-from semcal_ros.report.calibration.parameter_figures import plot_parameters
-from semcal_ros.report.calibration.pixel_size_figures import plot_pixel_sizes
-from semcal_ros.report.calibration.rms_figures import plot_residual_histogram, plot_rms
+from semcal_ros.report.calibration.parameter_figures import plot_parameters, plot_pixel_sizes
 from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
 from semcal_ros.report.calibration.worst_views import choose_worst_views
 from semcal_ros.report.html.encode import encode_pictures
 from semcal_ros.report.html.page import render, write_page
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
-
-__all__ = ["write_calibration_report"]
 
 # Example images on a page, at most: they make most of its size.
 _MAX_OVERLAYS = 24
@@ -86,6 +85,8 @@ _MAX_THUMBNAILS = 12
 _MAX_REJECTED = 200
 # Views that fit worst and can be opened.
 _WORST_VIEWS = 5
+# The verdict's figure is without ageing; a little leaves room for what an hour changes.
+_SAME_SESSION = ("--ageing", "0.01%")
 
 
 def write_calibration_report(
@@ -282,3 +283,45 @@ def _span_nm(result: CalibrationResult, rms_px: Mapping[float, float]) -> str:
     if least.partition(" ")[2] == largest.partition(" ")[2]:
         least = least.partition(" ")[0]
     return largest if largest.startswith(f"{least} ") else f"{least} to {largest}"
+
+
+def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]]:
+    """Suggest what to run next.
+
+    Parameters
+    ----------
+    verdict
+        What the calibration is good for.
+    calibration
+        Its file; if it is empty, nothing is suggested.
+
+    Returns
+    -------
+    list
+        (what it does, command) pairs, to be run in this order.
+    """
+    if not calibration:
+        return []
+    path = PurePath(calibration)
+    visit = verdict.next_visit
+    if visit is None:
+        if not math.isfinite(verdict.floor):
+            return []
+        budget = ["semcal", "at", calibration, f"{float(f'{verdict.at:.4g}'):g}", "--budget"]
+        return [("What the uncertainty consists of:", shlex.join(budget))]
+    # No lower than what the visit reaches, so that the plan ends with it.
+    percent = 100.0 * visit.largest
+    step = 10.0 ** (math.floor(math.log10(percent)) - 1)
+    target = f"{math.ceil(percent / step) * step:.2g}%"
+    views = f"views_{rounded_magnification(visit.magnification)}"
+    renewed = str(path.with_name(f"{path.stem}_improved{path.suffix}"))
+    return [
+        (
+            "What to set and how to tilt or turn:",
+            shlex.join(["semcal", "plan", calibration, "--target", target, *_SAME_SESSION]),
+        ),
+        (
+            f"With these views, of the same session, in the folder or bag {views}:",
+            shlex.join(["semcal", "update", calibration, views, "-o", renewed, *_SAME_SESSION]),
+        ),
+    ]

@@ -52,9 +52,6 @@ from semcal_ros.report.html.style import (
 )
 from semcal_ros.report.html.text import format_length, format_magnification
 
-__all__ = ["plot_predicted_errors"]
-
-
 # The map extends by this factor beyond the calibrated range, to show what extrapolation costs.
 _BEYOND = 1.5
 # Magnifications across the map.

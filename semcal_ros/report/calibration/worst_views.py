@@ -31,8 +31,6 @@ from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.style import choose_arrow_factor
 from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
 
-__all__ = ["WorstView", "choose_worst_views", "describe_pattern"]
-
 # Width of the picture of a view, px: a column of the page.
 _WIDTH = 480
 _JPEG_QUALITY = 75

@@ -33,19 +33,6 @@ from semcal_ros.core.arrays import Array, check_image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.html.text import remove_control_characters
 
-__all__ = [
-    "Picture",
-    "Readings",
-    "Strip",
-    "convert_to_8_bits",
-    "encode_data_uri",
-    "encode_figure",
-    "encode_jpeg",
-    "encode_pictures",
-    "encode_png",
-    "shrink",
-]
-
 # Two dots of the file per CSS pixel of the page (96 per inch), so that figures are sharp on
 # high-resolution screens.
 _FIGURE_DPI = 192.0

@@ -26,8 +26,6 @@ import jinja2
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_text
 
-__all__ = ["render", "write_page"]
-
 
 def render(
     template: str, values: Mapping[str, Any], *, folder: str | os.PathLike[str] | None = None

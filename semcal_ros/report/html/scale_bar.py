@@ -21,8 +21,6 @@ from dataclasses import dataclass
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.images.scale_bar import choose_scale_bar
 
-__all__ = ["DrawnScaleBar", "draw_scale_bar"]
-
 # Size of the type as a part of the width: legible where the picture is 390 px wide, and as a thumbnail of 200 px.
 _TYPE, _THUMBNAIL_TYPE = 0.042, 0.06
 # Distance of the bar from the edges, as a part of the width.

@@ -35,27 +35,6 @@ from matplotlib.ticker import (
 
 from semcal_ros.core.arrays import Array
 
-__all__ = [
-    "ACCENT",
-    "INK",
-    "LIGHT_MAP",
-    "MUTED",
-    "OURS",
-    "REFERENCE",
-    "SECOND",
-    "add_color_bar",
-    "add_legend",
-    "choose_arrow_factor",
-    "choose_log_ticks",
-    "create_figure",
-    "draw_contours",
-    "set_log_axis_y",
-    "set_magnification_axis",
-    "style_axes",
-    "style_field_axes",
-]
-
-
 INK = "#1b2430"
 MUTED = "#5b6674"
 OURS = "#0b5fa5"

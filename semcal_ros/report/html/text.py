@@ -20,14 +20,6 @@ import unicodedata
 
 import numpy as np
 
-__all__ = [
-    "format_length",
-    "format_magnification",
-    "format_px",
-    "format_with_sigma",
-    "remove_control_characters",
-]
-
 # Most decimals of a number: longer ones do not fit a table.
 _MOST_DECIMALS = 9
 

@@ -32,9 +32,6 @@ from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 
-__all__ = ["TEXTURES", "BallOnTip"]
-
-
 #: Statistics of the texture: noise of two grain sizes; Voronoi cells, each of one brightness; bright cells
 #: with dark seams; a narrow band of wavelengths; bright spots on a dark ground.
 TEXTURES = ("noise", "islands", "cracks", "speckle", "spots")

@@ -40,19 +40,6 @@ from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.substrate import Substrate
 
-__all__ = [
-    "CANTILEVER_MAGNIFICATIONS",
-    "CANTILEVER_PUSHES",
-    "SQUARE_TIP",
-    "BeamTip",
-    "CantileverFrame",
-    "CantileverPlan",
-    "CantileverScene",
-    "Charging",
-    "cantilever_plan",
-]
-
-
 CANTILEVER_MAGNIFICATIONS: tuple[float, ...] = (6450.0, 7760.0, 8890.0)
 """Those of Malti et al. (2012), section 4.3."""
 
@@ -252,8 +239,8 @@ class CantileverScene:
         a = self.load
         # Beyond the load the slope is constant.
         whole = 3.0 * a - 1.0 + (1.0 - a) ** 3
-        bent = 3.0 * a * inside**2 - inside**3 + np.maximum(inside - a, 0.0) ** 3
-        return np.asarray((bent + 3.0 * a**2 * beyond) / whole)
+        deflection = 3.0 * a * inside**2 - inside**3 + np.maximum(inside - a, 0.0) ** 3
+        return np.asarray((deflection + 3.0 * a**2 * beyond) / whole)
 
     @property
     def end_x_m(self) -> float:
@@ -470,10 +457,10 @@ def cantilever_plan(
     for number, push in enumerate(pushes):
         gap = 0.0 if push > 0.0 else _FREE_GAP_M
         deflection_m = push * base.push_direction * largest_deflection_m
-        bent = replace(base, deflection_m=deflection_m, gap_m=gap)
+        pushed = replace(base, deflection_m=deflection_m, gap_m=gap)
         for g in magnifications:
             for _ in range(frames_per_pose):
-                planned.append(CantileverFrame(step_s * len(planned), float(g), number, bent))
+                planned.append(CantileverFrame(step_s * len(planned), float(g), number, pushed))
     placed = {
         float(g): _place_specimen(microscope, float(g), base, view, rotation_rad)
         for g in magnifications

@@ -31,8 +31,6 @@ from semcal_ros.synthetic.specimens.cantilever import (
 )
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
 
-__all__ = ["TIPS", "CantileverExperiment", "make_tip", "random_cantilever"]
-
 #: Names of the outlines of a free end.
 TIPS = ("square", "semicircular", "tapered", "chamfered")
 

@@ -25,9 +25,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
 
-__all__ = ["GoldOnCarbon"]
-
-
 # Texels along each side of a tile: 17 diameters of its largest particle.
 _TILE = 1024
 # Smallest and largest radius. Their ratio of 5 exceeds the ratio of 4 between octaves, so that the

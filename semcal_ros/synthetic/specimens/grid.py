@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The interface of a specimen, and the two simplest: the chess grid, with its faults, and a uniform one."""
+"""The interface of a specimen, and the two simplest: the checkerboard, with its faults, and a uniform one."""
 
 from __future__ import annotations
 
@@ -25,18 +25,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
-
-__all__ = [
-    "SQUARES_M",
-    "TYPICAL_GRID",
-    "ChessGrid",
-    "FlatSpecimen",
-    "GridFaults",
-    "Specimen",
-    "UnevenSpecimen",
-    "square_for",
-]
-
 
 SQUARES_M: tuple[float, ...] = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 """Square sizes of the multi-scale grid."""
@@ -196,7 +184,7 @@ class FlatSpecimen:
 
 @dataclass(frozen=True)
 class ChessGrid:
-    """An endless chess board whose corners should be at the integer multiples of ``square_m``.
+    """An endless checkerboard whose corners should be at the integer multiples of ``square_m``.
 
     The square between (0, 0) and (1, 1) squares is bright.
 

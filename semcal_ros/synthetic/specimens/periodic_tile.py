@@ -23,8 +23,6 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Image
 
-__all__ = ["build_pyramid", "sample_pyramid"]
-
 
 def build_pyramid(tile: Image) -> tuple[Image, ...]:
     """Build levels (n, n) or (n, n, channels) of a periodic tile, each half the size of the last.

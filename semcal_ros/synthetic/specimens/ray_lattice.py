@@ -37,9 +37,6 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 
-__all__ = ["PlaneLattice", "RayLattice", "trace_ray_lattice"]
-
-
 # The errors in the header are those of this spacing and of quintic splines.
 _NODE_SPACING_PX = 12.0
 # Above 96 * 12 px the spacing grows with the frame, which bounds the cost of a wide one.

@@ -32,8 +32,6 @@ from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
 
-__all__ = ["SUBSTRATES", "Substrate", "SubstrateKind"]
-
 SubstrateKind = Literal["grains", "islands", "fibres", "scratches", "smooth"]
 
 #: The kinds of substrate.
@@ -183,8 +181,8 @@ def _draw_islands(rng: np.random.Generator) -> Image:
     field = _filter_noise(_draw_spectrum(rng), sigma, sigma)
     # The slope of the noise is 1 / sigma per texel.
     patches = 1.0 / (1.0 + np.exp(-np.clip((field - 0.2) * sigma, -30.0, 30.0)))
-    own = 0.25 * _filter_noise(_draw_spectrum(rng), 1.5 * sigma, 1.5 * sigma)
-    return np.asarray(patches * (1.0 + own), dtype=np.float32)
+    grain = 0.25 * _filter_noise(_draw_spectrum(rng), 1.5 * sigma, 1.5 * sigma)
+    return np.asarray(patches * (1.0 + grain), dtype=np.float32)
 
 
 def _draw_fibres(rng: np.random.Generator) -> Image:

@@ -28,9 +28,6 @@ from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.cantilever import NO_CHARGING, Charging
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
 
-__all__ = ["TargetSpecimen", "random_target"]
-
-
 # Texels per cell: seven for each square of a marker, and nine for the white on either side.
 _TEXELS_PER_BIT = 7
 _CELL = round(MARKER_BITS * _TEXELS_PER_BIT / SIDE)
@@ -68,7 +65,7 @@ class TargetSpecimen:
 
     def reflectivity(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
         """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
-        # As for the chess grid: a box with the second moment of the sample's parallelogram on each axis of the
+        # As for the checkerboard: a box with the second moment of the sample's parallelogram on each axis of the
         # target.
         box_m = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
         seen = np.ones(x_m.shape, dtype=np.float32)

@@ -21,7 +21,7 @@ function connect() {
   const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`);
   socket.binaryType = "arraybuffer";
   state.socket = socket;
-  socket.onopen = () => { setLink("connected", "ok"); sendWish(); };
+  socket.onopen = () => { setLink("connected", "ok"); sendRequest(); };
   socket.onmessage = (event) => (typeof event.data === "string" ? onText(JSON.parse(event.data)) : onBinary(event.data));
   socket.onclose = () => {
     if (state.socket !== socket) return;
@@ -40,11 +40,11 @@ document.addEventListener("visibilitychange", () => {
   if (document.hidden) { const socket = state.socket; state.socket = null; socket?.close(); setLink("paused", "warn"); } else reconnect();
 });
 
-function sendWish() {
+function sendRequest() {
   const pictures = { both: ["raw", "corrected"], blink: ["raw", "corrected"], raw: ["raw"], corrected: ["corrected"] }[state.layout];
   const width = Math.max(...Object.values(canvases).map((c) => c.clientWidth), 200) * Math.min(devicePixelRatio, 2);
   const contrast = state.contrast === "fixed" ? { mode: "fixed", low: state.low, high: state.high } : { mode: state.contrast };
-  send({ type: "wish", pictures, width: Math.round(width), zoom: state.zoom, centre: state.centre, contrast });
+  send({ type: "request", pictures, width: Math.round(width), zoom: state.zoom, centre: state.centre, contrast });
 }
 
 // -- what the server sends -------------------------------------------------------------------------
@@ -370,7 +370,7 @@ function setZoom(zoom, anchor = null) {
   }
   holdCentre();
   $("zoom").textContent = `${state.zoom >= 10 ? state.zoom.toFixed(0) : +state.zoom.toFixed(1)}×`;
-  sendWish();
+  sendRequest();
 }
 function holdCentre() {
   const half = 0.5 / state.zoom;
@@ -399,7 +399,7 @@ for (const [name, canvas] of Object.entries(canvases)) {
       state.centre = [state.drag.centre[0] - (event.clientX - state.drag.x) / box.width / state.zoom,
         state.drag.centre[1] - (event.clientY - state.drag.y) / box.height / state.zoom];
       holdCentre();
-      sendWish();
+      sendRequest();
     }
   });
   const end = (event) => {
@@ -425,7 +425,7 @@ for (const [name, canvas] of Object.entries(canvases)) {
 
 function press(buttons, chosen) { for (const b of buttons) b.setAttribute("aria-pressed", String(b === chosen)); }
 for (const button of all("[data-layout]")) {
-  button.addEventListener("click", () => { state.layout = button.dataset.layout; press(all("[data-layout]"), button); layOut(); sendWish(); draw(); });
+  button.addEventListener("click", () => { state.layout = button.dataset.layout; press(all("[data-layout]"), button); layOut(); sendRequest(); draw(); });
 }
 for (const button of all("[data-tool]")) {
   button.addEventListener("click", () => { state.tool = button.dataset.tool; press(all("[data-tool]"), button); layOut(); });
@@ -443,7 +443,7 @@ $("zoom-all").addEventListener("click", () => { state.centre = [0.5, 0.5]; setZo
 $("contrast").addEventListener("change", () => {
   state.contrast = $("contrast").value;
   $("low").disabled = $("high").disabled = state.contrast !== "fixed";
-  sendWish();
+  sendRequest();
 });
 for (const id of ["low", "high"]) {
   $(id).addEventListener("input", () => {
@@ -453,7 +453,7 @@ for (const id of ["low", "high"]) {
       if (id === "low") state.high = state.low + least; else state.low = state.high - least;
       $("low").value = state.low; $("high").value = state.high;
     }
-    sendWish();
+    sendRequest();
   });
 }
 $("time").addEventListener("input", () => { state.seeking = true; send({ type: "act", action: "seek", value: Number($("time").value) }); });
@@ -463,5 +463,5 @@ setInterval(() => {
   state.blink = state.blink === "raw" ? "corrected" : "raw";
   layOut(); draw();
 }, BLINK_MS);
-addEventListener("resize", () => { sendWish(); draw(); drawTrace(); });
+addEventListener("resize", () => { sendRequest(); draw(); drawTrace(); });
 connect();

@@ -21,14 +21,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcal_ros.applications.reconstruction.appearance import compute_log_grey
+from semcal_ros.applications.reconstruction.appearance import compute_log_grey, fit_shading
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
 from semcal_ros.applications.reconstruction.patches import (
     PatchSettings,
     PosedSurface,
     measure_patches,
 )
-from semcal_ros.applications.reconstruction.shading import fit_shading
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.specimens.ball import BallOnTip, Turning, ball_microscope, ball_plan
 

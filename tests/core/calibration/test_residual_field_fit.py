@@ -27,8 +27,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
-from semcal_ros.synthetic.laws import Exponential
-from semcal_ros.synthetic.microscope import Residual
+from semcal_ros.synthetic.microscope import Exponential, Residual
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 
 pytestmark = pytest.mark.slow

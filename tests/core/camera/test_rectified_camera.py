@@ -32,7 +32,7 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import Detector, Pose, preset, render_frame
-from semcal_ros.synthetic.laws import Constant
+from semcal_ros.synthetic.microscope import Constant
 from semcal_ros.synthetic.specimens.grid import ChessGrid
 
 SIZE = (512, 384)
@@ -244,7 +244,7 @@ def test_the_jacobian_is_that_of_what_another_camera_rectifies(field, terms):
     own = square.project_jacobian(POINTS)
     # Its own parameters are linear in the raw camera's: undo that to compare.
     linear = np.eye(own.shape[2])
-    linear[:own_count, :own_count] = camera._rectified_from_own
+    linear[:own_count, :own_count] = camera._rectified_from_parameters
     units = np.concatenate([sigmas, np.full(own.shape[2] - own_count, 1e-3)])
     np.testing.assert_allclose(own @ linear * units, by_source * units, atol=2e-6)
     spread = np.einsum("nip,pq,niq->ni", by_source, camera.joint_covariance, by_source)

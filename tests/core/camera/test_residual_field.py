@@ -25,7 +25,8 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, SETTLING_TIMES
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
+from semcal_ros.core.camera.thresholds import SETTLING_TIMES
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier

@@ -30,7 +30,6 @@ from semcal_ros.core.camera.scan_distortion import (
     ALONG_COUNT,
     SCAN_NAMES,
     SETTLING,
-    SETTLING_TIMES,
     Raster,
     deflection_shift,
     deflection_stretch,
@@ -38,6 +37,7 @@ from semcal_ros.core.camera.scan_distortion import (
     raw_from_deflection,
     scan_functions,
 )
+from semcal_ros.core.camera.thresholds import SETTLING_TIMES
 
 # The middle is at (255.5, 191.5), the borders at -0.5 and 511.5, and at -0.5 and 383.5.
 SIZE = (512, 384)

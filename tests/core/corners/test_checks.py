@@ -22,10 +22,9 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.corners.checks import inflate_variance
+from semcal_ros.core.corners.checks import find_consistent, inflate_variance
 from semcal_ros.core.corners.corner_fit import CornerFit
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.corners.neighbour_consistency import find_consistent
 
 
 def fits(chi2: Array, freedom: float) -> CornerFit:

@@ -33,7 +33,7 @@ from semcal_ros.nodes.frames.stream import (
     FrameInput,
     StreamFrame,
     StreamNode,
-    describe_darkness,
+    describe_blank_image,
     is_late,
 )
 from tests.files.images.test_databar import scanned, with_bar
@@ -196,7 +196,7 @@ def test_a_microscope_that_says_nothing_after_its_restart_is_believed_again_afte
     ],
 )
 def test_an_image_without_a_picture_is_told(image: np.ndarray, said: str) -> None:
-    assert describe_darkness(image) == (f"the image is {said}" if said else "")
+    assert describe_blank_image(image) == (f"the image is {said}" if said else "")
 
 
 def test_a_blanked_beam_is_told_and_its_end_too(monkeypatch: pytest.MonkeyPatch) -> None:

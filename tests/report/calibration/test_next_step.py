@@ -30,7 +30,7 @@ from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.plan import PlannedVisit, Verdict
 from semcal_ros.report import write_calibration_report
 from semcal_ros.report.calibration import page
-from semcal_ros.report.calibration.next_step import suggest_commands
+from semcal_ros.report.calibration.page import suggest_commands
 from semcal_ros.report.html import encode
 from tests.helpers.report_samples import Page
 

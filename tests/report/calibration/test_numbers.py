@@ -43,8 +43,7 @@ from semcal_ros.core.camera.predicted_error import (
 )
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.calibration.camera_table import tabulate_cameras
-from semcal_ros.report.calibration.field_error_figures import plot_residual_field
+from semcal_ros.report.calibration.error_figures import plot_residual_field, plot_rms
 from semcal_ros.report.calibration.geometry import (
     compute_displacements,
     compute_rms_without_distortion,
@@ -54,11 +53,12 @@ from semcal_ros.report.calibration.numbers import (
     collect_warnings,
     compute_fitted_inner_px,
     compute_held_out_px,
+    compute_median_px,
+    tabulate_beside_paper,
+    tabulate_cameras,
     tabulate_magnifications,
 )
-from semcal_ros.report.calibration.paper import compute_median_px, tabulate_beside_paper
 from semcal_ros.report.calibration.parameter_figures import compute_focal_length_px, plot_parameters
-from semcal_ros.report.calibration.rms_figures import plot_rms
 from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
 from semcal_ros.report.html.text import (
     format_length,

@@ -46,9 +46,9 @@ from semcal_ros.report.calibration.geometry import compute_rms_without_distortio
 from semcal_ros.report.calibration.numbers import (
     compute_fitted_inner_px,
     compute_held_out_px,
+    tabulate_beside_paper,
     tabulate_magnifications,
 )
-from semcal_ros.report.calibration.paper import tabulate_beside_paper
 from semcal_ros.report.calibration.worst_views import choose_worst_views
 from semcal_ros.report.html import encode
 from semcal_ros.report.html.page import write_page

@@ -12,11 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figures over the image field: residuals of the corners, displacement by the distortion."""
+"""Figures of the errors against the magnification and over the image field, and of the displacement by distortion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -25,37 +25,173 @@ from matplotlib.figure import Figure
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.findings import assign_cells, concatenate_corners
+from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judgement.findings import (
+    assign_cells,
+    concatenate_corners,
+    normalise_residuals,
+)
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.wording import counted
 from semcal_ros.report.calibration.geometry import compute_displacements, remove_residual_field
-from semcal_ros.report.html.encode import Picture, encode_figure
+from semcal_ros.report.calibration.numbers import PAPER_RMS_PX
+from semcal_ros.report.html.encode import Picture, Readings, encode_figure
 from semcal_ros.report.html.style import (
+    ACCENT,
     INK,
+    MUTED,
     OURS,
+    REFERENCE,
     SECOND,
+    add_legend,
     choose_arrow_factor,
     create_figure,
     draw_contours,
+    set_log_axis_y,
+    set_magnification_axis,
+    style_axes,
     style_field_axes,
 )
-from semcal_ros.report.html.text import format_length, format_magnification
+from semcal_ros.report.html.text import format_length, format_magnification, format_px
 
-__all__ = [
-    "plot_distortion",
-    "plot_mean_residuals",
-    "plot_residual_field",
-    "plot_residuals",
-]
-
-
+# Ends of the histogram, in sigma; what lies beyond is counted in the last bins.
+_HISTOGRAM_LIMIT = 5.0
 # Cells across the field for mean residuals: large enough to hold many corners each.
 _RESIDUAL_CELLS = 12
 # More arrows overlap in a figure of this size.
 _MAX_ARROWS = 700
 # Least number of corners in a cell: the mean of fewer residuals says little.
 _MIN_IN_CELL = 5
+
+
+def plot_rms(
+    result: CalibrationResult, straight: Mapping[float, float], *, paper: bool = False
+) -> Picture:
+    """Plot RMS and held-out RMS at each magnification, on request beside the values of the paper.
+
+    ``straight`` is the error without correction of the distortion.
+    """
+    rms = rms_by_magnification(result.fit)
+    g = np.array(list(rms))
+    values = np.array(list(rms.values()))
+    held = np.array([result.held_out_rms_px.get(float(x), np.nan) for x in g])
+    uncorrected = np.array([straight.get(float(x), np.nan) for x in g])
+    noise = _predict_rms(result, g)
+    pixel_nm = np.array([1e9 * np.mean(result.model.at(float(x)).pixel_size_m) for x in g])
+    figure = create_figure(4.6, 5.4)
+    axes, lengths = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
+    style_axes(axes, xlabel="", ylabel="RMS error (px)")
+    style_axes(lengths, xlabel="magnification", ylabel="RMS error (nm)")
+    of_paper = PAPER_RMS_PX if paper else ()
+    for value, style in zip(of_paper, ("--", "-."), strict=False):
+        axes.axhline(
+            value, color=REFERENCE, linestyle=style, linewidth=1.2, label=f"paper: {value:g} px"
+        )
+    axes.plot(
+        g, uncorrected, "^:", color=MUTED, markersize=4, linewidth=1.0, label="distortion left in"
+    )
+    axes.plot(g, values, "o-", color=OURS, markersize=4, linewidth=1.2, label="all views fitted")
+    axes.plot(g, noise, "_", color=ACCENT, markersize=9, markeredgewidth=1.6, label="corner noise")
+    _plot_held_out(axes, g, held)
+    lengths.plot(g, values * pixel_nm, "o-", color=OURS, markersize=4, linewidth=1.2)
+    _plot_held_out(lengths, g, held * pixel_nm)
+    set_magnification_axis(lengths, g[0], g[-1])
+    in_nm = np.concatenate([values, held]) * np.concatenate([pixel_nm, pixel_nm])
+    in_nm = in_nm[np.isfinite(in_nm) & (in_nm > 0.0)]
+    set_log_axis_y(lengths, 0.6 * float(in_nm.min()), 1.7 * float(in_nm.max()))
+    shown = np.concatenate([values, held, uncorrected, noise, of_paper])
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    set_log_axis_y(axes, 0.6 * float(shown.min()), 1.7 * float(shown.max()))
+    add_legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
+    figure.align_ylabels([axes, lengths])
+    return encode_figure(
+        figure,
+        f"RMS error against magnification, {values.min():.3f} to {values.max():.3f} px"
+        + (f", beside the paper's {of_paper[0]:g} and {of_paper[1]:g} px." if of_paper else "."),
+        "Held out: the images of this magnification, judged by a "
+        "calibration from all other magnifications. Hollow: the lowest and highest one, which are "
+        "extrapolated in this test. Corner noise: what the uncertainty of the corners alone "
+        "explains.",
+        Readings(
+            [axes, lengths],
+            g,
+            [
+                f"{format_magnification(x)}: fitted {_format_error(fitted, nm)}; "
+                f"held out {_format_error(left_out, nm)}; distortion left in {_format_error(left_in, nm)}"
+                for x, nm, fitted, left_out, left_in in zip(
+                    g, pixel_nm, values, held, uncorrected, strict=True
+                )
+            ],
+        ),
+    )
+
+
+def _format_error(px: float, pixel_nm: float) -> str:
+    """An error in px and as a length; a dash where it is not known."""
+    if not np.isfinite(px):
+        return format_px(px)
+    return f"{format_px(px)}, {format_length(1e-9 * px * pixel_nm)}"
+
+
+def _predict_rms(result: CalibrationResult, g: Array) -> Array:
+    """Predict the (G,) RMS error from the 1-sigma of the corners alone, px."""
+    variances: dict[float, list[Array]] = {float(x): [] for x in g}
+    for view in result.views:
+        variances[float(view.magnification)].append(view.dimensions * view.sigma_px**2)
+    return np.array([np.sqrt(np.mean(np.concatenate(v))) for v in variances.values()])
+
+
+def _plot_held_out(axes: Axes, g: Array, held: Array) -> None:
+    if len(g) < 2 or not np.any(np.isfinite(held)):
+        return
+    inner = np.isfinite(held)
+    inner[[0, -1]] = False
+    ends = np.isfinite(held) & ~inner
+    axes.plot(g[inner], held[inner], "s", color=SECOND, markersize=4.5, label="held out")
+    axes.plot(
+        g[ends],
+        held[ends],
+        "s",
+        color=SECOND,
+        markersize=5,
+        markerfacecolor="none",
+        label="held out, extrapolated",
+    )
+
+
+def plot_residual_histogram(result: CalibrationResult) -> Picture:
+    """Plot a histogram of residuals over their 1-sigma, beside the normal distribution."""
+    values = normalise_residuals(result).ravel()
+    beyond = float(np.mean(np.abs(values) > 3.0))
+    spread = float(np.sqrt(np.mean(values**2)))
+    limit = _HISTOGRAM_LIMIT
+    figure = create_figure(4.6, 3.2)
+    axes = figure.add_subplot()
+    style_axes(axes, xlabel="residual over its predicted 1-sigma", ylabel="share per unit")
+    edges = np.linspace(-limit, limit, 51)
+    density = np.histogram(np.clip(values, -limit, limit), edges)[0] / (
+        len(values) * np.diff(edges)
+    )
+    axes.stairs(density, edges, fill=True, color=OURS, alpha=0.45, label="residuals")
+    x = np.linspace(-limit, limit, 201)
+    axes.plot(
+        x,
+        np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi),
+        "--",
+        color=INK,
+        linewidth=1.3,
+        label="normal distribution",
+    )
+    axes.set_xlim(-limit, limit)
+    add_legend(axes, loc="upper left")
+    text = f"spread {spread:.2f}; {100.0 * beyond:.1f} % beyond 3 (normal: 0.3 %)"
+    return encode_figure(
+        figure,
+        f"Histogram of residuals over their predicted 1-sigma: {text}.",
+        f"Residuals over the predicted uncertainty of their corners: {text}. Wider than the dashed "
+        "line: the corners are worse than they claim, or the model misses something.",
+    )
 
 
 def plot_mean_residuals(result: CalibrationResult) -> Picture:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figure of a reconstructed ball: cloud, mesh, distances from the sphere."""
+"""Figures of what was reconstructed: a ball with cloud, mesh and distances from the sphere, or a map of heights."""
 
 from __future__ import annotations
 
@@ -27,32 +27,33 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from semcal_ros.applications.reconstruction import Ball, Structure
+from semcal_ros.applications.reconstruction.tilt_series import HeightMap
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.wording import counted
 from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.files.images.scale_bar import choose_scale_bar
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     INK,
     MUTED,
     OURS,
     SECOND,
+    add_color_bar,
     add_legend,
     create_figure,
     style_axes,
 )
 
-__all__ = ["plot_ball", "render_ball", "write_ball_figure"]
-
-
 # nm in a metre.
 _NM = 1e9
 # Resolution: 1056 px across the figure of 9.6 inches.
-_DPI = 110.0
+_BALL_DPI = 110.0
+_RELIEF_DPI = 150.0
 
 
 def render_ball(structure: Structure, ball: Ball) -> bytes:
     """Draw :func:`plot_ball` as a PNG file."""
-    return encode_png(plot_ball(structure, ball), _DPI)
+    return encode_png(plot_ball(structure, ball), _BALL_DPI)
 
 
 def write_ball_figure(structure: Structure, ball: Ball, file: Path) -> None:
@@ -126,3 +127,41 @@ def _plot_distances(axes: Axes, ball: Ball) -> None:
         fontsize=9,
         color=INK,
     )
+
+
+def write_relief_figure(heights: HeightMap, file: Path) -> None:
+    """Write :func:`plot_relief` as a PNG, completely or not at all."""
+    atomic_write_bytes(file, encode_png(plot_relief(heights), _RELIEF_DPI))
+
+
+def plot_relief(heights: HeightMap) -> Figure:
+    """Plot heights and their 1-sigma; grey where they are not known."""
+    figure = create_figure(10.0, 4.6)
+    rows, columns = heights.height_m.shape
+    bar = choose_scale_bar(columns, heights.pixel_size_m)
+    parts = (
+        ("height", heights.height_m, "viridis"),
+        ("1-sigma of the height", heights.sigma_m, "magma"),
+    )
+    for index, (name, values, colours) in enumerate(parts):
+        axes = figure.add_subplot(1, 2, index + 1)
+        axes.set_facecolor("0.8")
+        low, high = np.nanpercentile(values, (0.5, 99.5))
+        unit, factor = ("µm", 1e6) if max(abs(low), abs(high)) >= 1e-6 else ("nm", 1e9)
+        low, high = factor * low, factor * high
+        shown = axes.imshow(factor * values, cmap=colours, vmin=low, vmax=high)
+        add_color_bar(shown, axes, f"{name} ({unit})", shrink=0.85)
+        left, y = 0.04 * columns, 0.95 * rows
+        axes.plot([left, left + bar.length_px], [y, y], color="black", linewidth=5)
+        axes.plot([left, left + bar.length_px], [y, y], color="white", linewidth=3)
+        axes.text(
+            left,
+            y - 0.02 * rows,
+            bar.label,
+            color="white",
+            fontsize=8,
+            bbox={"facecolor": "black", "alpha": 0.5, "linewidth": 0},
+        )
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return figure

@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Pinhole cameras as files of OpenCV, ROS, mrcal and COLMAP.
+"""Cameras as files of other programs: of OpenCV, ROS, mrcal, COLMAP, and of ImageJ and Fiji.
 
 Formats: OpenCV ``FileStorage`` in YAML; the calibration files of ROS's ``camera_info_manager``; ``.cameramodel``
 of mrcal (its documentation, "Camera model file formats"); ``cameras.txt`` of COLMAP (its documentation, "Output
-Format"). COLMAP counts pixels from the corner of the first pixel, the others from its centre.
+Format"). COLMAP counts pixels from the corner of the first pixel, the others from its centre. ImageJ
+and Fiji take the scale from a macro, and the distortion from a map, which other programs read, too.
 """
 
 from __future__ import annotations
@@ -27,11 +28,10 @@ import cv2
 import numpy as np
 import yaml
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.camera.pinhole_model import PinholeModel
 from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
-
-__all__ = ["format_colmap", "format_mrcal", "format_opencv", "format_ros"]
+from semcal_ros.core.camera.scan_camera import ScanCamera
 
 
 def format_opencv(
@@ -114,3 +114,22 @@ def format_colmap(camera: PinholeModel, notes: Sequence[str]) -> str:
         f"1 {model} {camera.width} {camera.height} {numbers}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def format_macro(pixel_size_m: tuple[float, float], notes: Sequence[str]) -> str:
+    """Format a macro that sets the pixel size of the current image."""
+    x_nm, y_nm = (1e9 * size for size in pixel_size_m)
+    lines = [f"// {note}" for note in notes]
+    lines.append(f'setVoxelSize({x_nm!r}, {y_nm!r}, 1, "nm");')
+    return "\n".join(lines) + "\n"
+
+
+def compute_raw_map(camera: ScanCamera) -> Array32:
+    """Compute x and y of the raw pixel that each rectified pixel shows, (2, height, width) px.
+
+    They are NaN where there is none.
+    """
+    y, x = np.mgrid[0 : camera.height, 0 : camera.width]
+    raw = camera.raw_from_rect(np.stack([x.ravel(), y.ravel()], axis=1))
+    shape = (camera.height, camera.width)
+    return np.stack([raw[:, k].reshape(shape) for k in (0, 1)]).astype(np.float32)
