@@ -30,7 +30,7 @@ from itertools import combinations, pairwise, product
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Image, check_positive
+from semcal_ros.core.arrays import AnyImage, Array, check_positive
 from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
 from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -69,6 +69,7 @@ __all__ = [
     "extend_calibration",
     "find_unrest",
     "make_model",
+    "make_predictor",
     "measure_ladder",
 ]
 
@@ -111,7 +112,7 @@ class LadderPicture:
         Number of the stretch between which the magnification was not set; None: it changes with the magnification.
     """
 
-    image: Image
+    image: AnyImage
     magnification: float
     name: str = ""
     scan_rotation_rad: float | None = None
@@ -445,7 +446,7 @@ def _match_all(
         best: tuple[float, Correspondences] | None = None
         reason = ""
         for turn in _turns_to_try(pictures[first], pictures[second]):
-            predict = _predictor(cameras[first], cameras[second], turn, scale)
+            predict = make_predictor(cameras[first], cameras[second], turn, scale)
             found = match_pictures(prepared[first], prepared[second], predict)
             if isinstance(found, Rejection):
                 reason = (
@@ -471,10 +472,20 @@ def _turns_to_try(first: LadderPicture, second: LadderPicture) -> tuple[float, .
     return (second.scan_rotation_rad - first.scan_rotation_rad,)
 
 
-def _predictor(
+def make_predictor(
     first: ScanCamera, second: ScanCamera, turn: float, scale: float
 ) -> Callable[[Array], Array]:
-    """Where the second picture would show a pixel of the first if their middles showed the same."""
+    """Where the second picture would show a pixel of the first if their middles showed the same.
+
+    Parameters
+    ----------
+    first, second
+        The cameras of both.
+    turn
+        By how much the scan of the second is turned against that of the first, rad.
+    scale
+        Pixels of the calibration per pixel of the pictures.
+    """
     c, s = np.cos(turn), np.sin(turn)
     rotation = np.array([[c, -s], [s, c]])
 
