@@ -57,7 +57,7 @@ from semcal_ros.core.errors import (
     Rejection,
 )
 from semcal_ros.core.ladder.acquisition import PictureRequest
-from semcal_ros.core.ladder.extend import LadderPicture
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.view_recorder import ViewRecorder
 from semcal_ros.files.recordings import RecordedFrame

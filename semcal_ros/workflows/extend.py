@@ -25,7 +25,8 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.provenance import Provenance
-from semcal_ros.core.ladder.extend import LadderPicture, LadderResult, extend_calibration
+from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.conditions import ConditionsComparison

@@ -40,7 +40,7 @@ from semcal_ros.core.ladder.correspondences import (
     SmoothMap,
     locate_picture,
 )
-from semcal_ros.core.ladder.extend import LadderPicture, make_predictor
+from semcal_ros.core.ladder.matching import LadderPicture, make_predictor
 from semcal_ros.core.ladder.plan import plan_ladder
 
 __all__ = [

@@ -35,7 +35,7 @@ from semcal_ros.core.ladder.acquisition import (
     plan_pictures,
     take_picture,
 )
-from semcal_ros.core.ladder.extend import LadderPicture
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 from semcal_ros.nodes.acquisition.run import AWAY, Run, Taker
 from semcal_ros.nodes.common.parameters import Parameters

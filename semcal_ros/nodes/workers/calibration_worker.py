@@ -34,7 +34,7 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationError, SemcalError
-from semcal_ros.core.ladder.extend import LadderPicture
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded

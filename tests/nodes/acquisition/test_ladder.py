@@ -28,7 +28,7 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError
 from semcal_ros.core.ladder.acquisition import PictureRequest
-from semcal_ros.core.ladder.extend import LadderPicture
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.nodes.acquisition.ladder import (
     LadderGoal,
     LadderRun,
