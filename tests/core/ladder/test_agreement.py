@@ -35,7 +35,12 @@ from semcal_ros.core.ladder.agreement import (
     flip_match,
 )
 from semcal_ros.core.ladder.correspondences import Correspondences, SmoothMap
-from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
+from semcal_ros.core.ladder.extend import (
+    LadderMeasurement,
+    LadderResult,
+    extend_calibration,
+    find_unrest,
+)
 from semcal_ros.core.ladder.matching import (
     LadderPicture,
     Match,
@@ -253,6 +258,16 @@ def test_which_magnification_is_stated_wrongly(
 
 
 # -- what is said ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("spread_px", "count"), [(0.5, 0), (4.0, 1)])
+def test_a_large_drift_is_a_note_with_what_it_may_be(spread_px: float, count: int) -> None:
+    fit = replace(_fit_of((1.0,) * 4, (), (0.0,) * 4), drift=DriftSpread(spread_px, 0.1))
+    measured = LadderMeasurement(fit.state.setup, fit, (), 1.0, (), (), (0, 1, 2, 3))
+    notes = [text for text in find_unrest(measured) if "fixed to the scan" in text]
+    assert len(notes) == count
+    if notes:
+        assert "a drift within a frame of 4.0 px (1-sigma) at 16000x" in notes[0]
 
 
 def test_pictures_of_two_sizes_are_told_as_sizes() -> None:
