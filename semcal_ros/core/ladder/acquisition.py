@@ -40,6 +40,7 @@ from semcal_ros.core.ladder.correspondences import (
     SmoothMap,
     locate_picture,
 )
+from semcal_ros.core.ladder.extend import scale_of_pictures
 from semcal_ros.core.ladder.matching import LadderPicture, make_predictor
 from semcal_ros.core.ladder.plan import plan_ladder
 
@@ -157,8 +158,13 @@ def find_offset(
     Returns
     -------
     (2,) that place off the middle of the picture, px; or why the two were not matched.
+
+    Raises
+    ------
+    InvalidValueError
+        If they differ in size, or have not the shape of those of the calibration.
     """
-    scale = model.image_width / picture.image.shape[1]
+    scale = scale_of_pictures(model, (reference, picture))
     # The first one of a match has the larger pixels.
     upwards = picture.magnification >= reference.magnification
     first, second = (reference, picture) if upwards else (picture, reference)
@@ -211,7 +217,10 @@ def take_picture(
     ------
     CalibrationError
         With what is wrong with it.
+    InvalidValueError
+        If it has not the shape of the pictures of the calibration.
     """
+    scale_of_pictures(model, (picture,))
     if not is_same_magnification(request.magnification, picture.magnification):
         raise CalibrationError(
             f"a picture at {picture.magnification:g}x", expected=f"{request.magnification:g}x"

@@ -80,6 +80,7 @@ __all__ = [
     "find_unrest",
     "make_model",
     "measure_ladder",
+    "scale_of_pictures",
 ]
 
 # Slope of a specimen that is not flat any more: 5 degrees, ten times that of one that is mounted flat.
@@ -257,7 +258,7 @@ def measure_ladder(
     calibrated
         Whether the model is a calibration, with which the pictures must agree, and not a mere prior.
     """
-    scale = _scale_of_pictures(model, pictures)
+    scale = scale_of_pictures(model, pictures)
     places = tuple(_places(pictures))
     size = model.image_width, model.image_height
     setup = make_setup(model, places, size)
@@ -482,8 +483,8 @@ def _check_range(model: CalibrationModel, magnifications: Sequence[float]) -> No
     check_steps(seen, (low, high))
 
 
-def _scale_of_pictures(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> float:
-    """Pixels of the calibration per pixel of the pictures."""
+def scale_of_pictures(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> float:
+    """Pixels of the calibration per pixel of the pictures; raises :class:`InvalidValueError` for another shape."""
     shapes = {picture.image.shape for picture in pictures}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:
         sizes = " and ".join(" x ".join(map(str, shape[1::-1])) for shape in sorted(shapes))

@@ -22,7 +22,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.acquisition import (
     PictureRequest,
     TakenPicture,
@@ -111,6 +111,12 @@ def test_what_shows_nothing_is_refused_at_once() -> None:
     white = LadderPicture(np.full((SIZE, SIZE), 255, dtype=np.uint8), G)
     with pytest.raises(CalibrationError, match="100 % of the pixels are white"):
         take_picture(model, [], MIDDLE, white)
+
+
+def test_another_shape_than_that_of_the_calibration_is_refused_at_once() -> None:
+    wide = LadderPicture(np.zeros((SIZE // 2, SIZE), dtype=np.uint8), G)
+    with pytest.raises(InvalidValueError, match="256 x 128 px; expected the shape of the"):
+        take_picture(calibration_of(make_scope()), [], MIDDLE, wide)
 
 
 def test_either_sense_of_a_turned_scan_serves(middle: TakenPicture) -> None:
