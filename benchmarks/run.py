@@ -36,8 +36,11 @@ start_up     commands and nodes before they do anything, beside the import of nu
 Not among these: ``python -m benchmarks.drift.soak``, 20 000 frames out and back,
 ``python -m benchmarks.drift.turning``, frames that turn or grow,
 ``python -m benchmarks.drift.scenes``, scenes of every kind with tools, overlays and lattices in them,
+``python -m benchmarks.calibration.ladder``, calibrations that a specimen extends beyond their grid,
+``python -m benchmarks.calibration.observable``, what of that shifts, turns and zooms tell,
 ``python -m benchmarks.calibration.fleet``, random microscopes that a calibration has to hold on,
-``python -m benchmarks.calibration.starts``, random first states that have to end at the same place, and
+``python -m benchmarks.calibration.starts``, random first states that have to end at the same place,
+``python -m benchmarks.calibration.solvers``, the solver of the calibration beside others, and
 ``python -m benchmarks.calibration.looks``, random pictures of grids that have to be found.
 
 Everything but one column is measured on simulated data whose truth is known, with fixed seeds.

@@ -51,7 +51,8 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.predicted_error import predict_aligned_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.ladder.extend import LadderPicture, LadderResult, extend_calibration
+from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.synthetic.grid_views import grid_views
 
 __all__ = ["Case", "compare", "draw_case", "record"]
@@ -83,13 +84,13 @@ def camera_at(scope: Scope, g: float) -> ScanCamera:
     return ScanCamera(g, *values, scope.width, scope.height)
 
 
-def draw_case(seed: int, size: int, with_relay: bool) -> Case:
-    """Draw a microscope and calibrate it."""
+def draw_case(seed: int, size: int, with_relay: bool, squares: float = SQUARES) -> Case:
+    """Draw a microscope and calibrate it by a grid whose squares are off by ``squares`` (1-sigma)."""
     rng = np.random.default_rng([seed, 35])
     relay = (float(np.exp(rng.uniform(np.log(1.3e4), np.log(7e4)))), 0.005) if with_relay else None
     scope = draw_scope(rng, size, relay)
     # The squares are not what the certificate says.
-    stretch = 1.0 + SQUARES * float(rng.normal())
+    stretch = 1.0 + squares * float(rng.normal())
     views = []
     for way in range(2):
         for number, g in enumerate(CALIBRATED):
@@ -106,7 +107,7 @@ def draw_case(seed: int, size: int, with_relay: bool) -> Case:
                     square_px=30.0,
                 )
             ]
-    options = CalibrationOptions(squares_sigma=SQUARES)
+    options = CalibrationOptions(squares_sigma=squares)
     found = calibrate_views(
         views, image_size=(size, size), display_width_m=scope.display_m, options=options
     )

@@ -22,24 +22,30 @@ from pathlib import Path
 
 import click
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import (
     PATH,
     config_option,
     output_option,
+    parse_magnification,
     parse_ratio,
     parse_tilts,
+    refuse_with,
     require_folder,
 )
 from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.acquisition import MOST_VIEWS
 from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.core.ladder.plan import plan_ladder
 
 __all__ = ["command"]
 
 
 def _parse_range(
-    _context: click.Context, _parameter: click.Parameter, text: str
-) -> tuple[float, float]:
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> tuple[float, float] | None:
+    if text is None:
+        return None
     try:
         low, high = (float(part) for part in text.split(","))
     except ValueError:
@@ -58,10 +64,23 @@ def _wait_for_enter(text: str) -> None:
 @click.option(
     "--range",
     "magnifications",
-    required=True,
     callback=_parse_range,
     metavar="LOW,HIGH",
-    help="Magnifications to calibrate.",
+    help="Magnifications to calibrate by a grid.",
+)
+@click.option(
+    "--extend",
+    "extended",
+    type=PATH,
+    metavar="CALIBRATION",
+    help="Instead: extend this calibration by a ladder of magnifications over a specimen.",
+)
+@click.option(
+    "--to",
+    "last",
+    callback=parse_magnification,
+    metavar="G",
+    help="Magnification that --extend reaches, such as 100000x.",
 )
 @click.option(
     "--target",
@@ -93,7 +112,7 @@ def _wait_for_enter(text: str) -> None:
     type=click.Choice(["scan_rotation", "rotation", "nothing"]),
     default="scan_rotation",
     show_default=True,
-    help="What turns the grid in the image between views.",
+    help="What turns the grid in the image between views, or a ladder's last picture.",
 )
 @click.option(
     "--most-views",
@@ -117,7 +136,9 @@ def _wait_for_enter(text: str) -> None:
 @config_option
 def command(
     output: Path,
-    magnifications: tuple[float, float],
+    magnifications: tuple[float, float] | None,
+    extended: Path | None,
+    last: float | None,
     target: float,
     microscope: str,
     by_hand: bool,
@@ -132,16 +153,33 @@ def command(
 ) -> None:
     """Calibrate a live microscope unattended: move it, take views of the grid, until nm per pixel is certain enough.
 
-    The nodes of the microscope must run, with the grid in view and in focus, and moving allowed. Exit status 1 if the
-    target was not met; what was calibrated is written all the same. All pictures are recorded, so that --resume can go
-    on after Ctrl-C, and `semcal calibrate` can use them again.
+    Or extend a calibration: move over a flat, textured specimen, from inside the calibrated range to --to.
+
+    The nodes of the microscope must run, with grid or specimen in view and in focus, and moving allowed. Exit status 1
+    if the target was not met; what was calibrated is written all the same. All pictures are recorded, so that --resume
+    can go on after Ctrl-C, and `semcal calibrate` or `semcal extend` can use them again.
 
     \b
     Example:
       semcal acquire -o cal.yaml --range 500,10000 --microscope virtual_sem --config virtual_sem
       semcal acquire -o cal.yaml --range 500,10000 --microscope virtual_sem --config virtual_sem --resume cal_views
       semcal acquire -o cal.yaml --range 500,10000 --by-hand
+      semcal acquire -o cal_20kx.yaml --extend cal.yaml --to 20000x --microscope virtual_sem --config virtual_sem
     """
+    if (magnifications is None) == (extended is None):
+        raise InvalidValueError(
+            "neither --range nor --extend" if extended is None else "--range and --extend",
+            expected="one of the two",
+        )
+    if (extended is None) != (last is None):
+        raise InvalidValueError(
+            "--to without --extend" if extended is None else "--extend without --to",
+            expected="both, such as --extend cal.yaml --to 100000x",
+        )
+    if extended is not None and last is not None:
+        refuse_with("--extend", "which looks at no grid", ("target", "tilts", "most_views"))
+        # What is wrong is said before anything is started.
+        plan_ladder(Calibration.load(extended), last)
     require_folder(output)
     load_config(config)
     if record is not None and no_record:
@@ -169,13 +207,18 @@ def command(
     parameters: dict[str, object] = {
         "config": config,
         "output": str(output.absolute()),
-        "lowest_magnification": magnifications[0],
-        "highest_magnification": magnifications[1],
-        "target": target,
-        "tilts_deg": f"'{','.join(f'{math.degrees(tilt):.12g}' for tilt in tilts)}'",
         "turn_by": turn_by,
-        "most_views": most_views,
     }
+    if magnifications is not None:
+        parameters |= {
+            "lowest_magnification": magnifications[0],
+            "highest_magnification": magnifications[1],
+            "target": target,
+            "tilts_deg": f"'{','.join(f'{math.degrees(tilt):.12g}' for tilt in tilts)}'",
+            "most_views": most_views,
+        }
+    if extended is not None and last is not None:
+        parameters |= {"calibration": str(extended.absolute()), "extend_to": last}
     if not by_hand:
         parameters["microscope"] = microscope
     if record is not None:

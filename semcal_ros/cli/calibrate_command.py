@@ -33,6 +33,7 @@ from semcal_ros.cli.options import (
     dask_option,
     output_option,
     parse_ratio,
+    refuse_with,
 )
 from semcal_ros.cli.output import (
     echo_notes,
@@ -125,13 +126,7 @@ def _calibrate_specimen(
 ) -> None:
     context = click.get_current_context()
     refuse_grid_options("--specimen looks at a specimen")
-    for name in _OF_GRIDS:
-        if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
-            raise InvalidValueError(
-                f"--{name.replace('_', '-')} with --specimen, which looks at no grid",
-                expected="one of the two",
-                do=f"leave out --{name.replace('_', '-')}",
-            )
+    refuse_with("--specimen", "which looks at no grid", _OF_GRIDS)
     at = context.meta.get(PIXEL_SIZE_AT)
     missing = [at, known_length, stage_scale].count(None)
     if missing != 2:

@@ -32,7 +32,9 @@ from semcal_ros.cli.output import (
 )
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.ladder.extend import LadderStep, RejectedPair
+from semcal_ros.core.ladder.adjustment import SETTLED_DRIFT_PX
+from semcal_ros.core.ladder.extend import LadderStep
+from semcal_ros.core.ladder.matching import RejectedPair
 from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.extend import RecordingExtension, extend
@@ -78,8 +80,10 @@ def command(
     low, high = ladder.anchored
     click.echo(f"range: {whole[0]:g}x to {whole[1]:g}x, of which {low:g}x to {high:g}x by the grid")
     echo_steps(done.calibration, done.result.steps)
-    last = done.result.steps[-1].magnification
-    click.echo(f"drift within a frame at {last:g}x: {done.result.drift_px:.2f} px (1-sigma)")
+    # A larger one is a note, with what it may be.
+    if done.result.drift_px <= SETTLED_DRIFT_PX:
+        last = done.result.steps[-1].magnification
+        click.echo(f"drift within a frame at {last:g}x: {done.result.drift_px:.2f} px (1-sigma)")
     for weakness in done.result.weaknesses:
         click.echo(f"note: {weakness}", err=True)
     echo_notes(done.notes)

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -209,3 +209,39 @@ def require_folder(path: Path) -> None:
         )
     if path.is_dir():
         raise InvalidValueError(f"{path} is a folder", expected="the name of a file")
+
+
+def parse_magnification(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | None:
+    """Callback of an option: a magnification such as ``100000x``."""
+    if text is None:
+        return None
+    try:
+        return float(text.strip().removesuffix("x"))
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is not a magnification such as 100000x") from error
+
+
+def refuse_with(option: str, why: str, names: Iterable[str]) -> None:
+    """Refuse parameters of a command that were given on the command line beside an option.
+
+    Parameters
+    ----------
+    option, why
+        The option, and why it goes with none of them.
+    names
+        Of the parameters.
+
+    Raises
+    ------
+    InvalidValueError
+        If one of them was given.
+    """
+    context = click.get_current_context()
+    for name in names:
+        if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
+            given = "--" + name.replace("_", "-")
+            raise InvalidValueError(
+                f"{given} with {option}, {why}", expected="one of the two", do=f"leave out {given}"
+            )

@@ -27,6 +27,7 @@ from semcal_ros.cli.options import (
     PATH,
     config_option,
     json_option,
+    parse_magnification,
     parse_ratio,
     squares_option,
 )
@@ -42,17 +43,6 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.ladder.plan import PlannedStep, plan_ladder
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
-
-
-def _parse_magnification(
-    _context: click.Context, _parameter: click.Parameter, text: str | None
-) -> float | None:
-    if text is None:
-        return None
-    try:
-        return float(text.strip().removesuffix("x"))
-    except ValueError as error:
-        raise click.BadParameter(f"{text!r} is not a magnification such as 100000x") from error
 
 
 @click.command("plan")
@@ -86,7 +76,7 @@ def _parse_magnification(
     "--extend",
     "last",
     default=None,
-    callback=_parse_magnification,
+    callback=parse_magnification,
     metavar="G",
     help="Instead: pictures of a specimen with which `semcal extend` reaches this magnification, such as 100000x.",
 )

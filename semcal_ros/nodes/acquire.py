@@ -75,7 +75,8 @@ class _Acquirer(CalibrationServer):
         if self.acquisition_progress.state == "done":
             self._say(f"all pictures: {self.recording}")
         elif self.recording.exists():
-            views = counted(self.acquisition_progress.views, "view")
+            unit = "view" if self._acquisition is None else self._acquisition.unit
+            views = counted(self.acquisition_progress.views, unit)
             self._say(
                 f"ended with {views}; the same command with --resume {self.recording} goes on"
             )
@@ -107,7 +108,7 @@ class _Acquirer(CalibrationServer):
                 )
             time.sleep(_POLL_S)
         with self._begins:
-            self._say(self.acquire())
+            self._say(self.extend() if self.parameters["extend_to"] > 0.0 else self.acquire())
 
     def _follow(self) -> None:
         asked = ""
@@ -127,7 +128,7 @@ class _Acquirer(CalibrationServer):
         self._tell_end()
         if self.has_calibration:
             self._say(self.save())
-        if progress.state == "done" and progress.largest <= self.parameters["target"]:
+        if self.acquisition_reached:
             self.exit_status = 0
 
 

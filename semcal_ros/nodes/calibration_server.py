@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -37,9 +38,10 @@ from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fi
 from semcal_ros.bridge.images import fill_image, to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.acquisition import (
+    AcquisitionGoal,
     ViewRequest,
     find_picture_fault,
-    is_magnification_of,
+    is_same_magnification,
 )
 from semcal_ros.core.calibration.judgement.check import Verdict
 from semcal_ros.core.calibration.judgement.findings import measure_view_coverage
@@ -54,12 +56,15 @@ from semcal_ros.core.errors import (
     MicroscopeError,
     Rejection,
 )
+from semcal_ros.core.ladder.acquisition import PictureRequest
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.view_recorder import ViewRecorder
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
-from semcal_ros.nodes.acquisition.recorded import read_views
+from semcal_ros.nodes.acquisition.ladder import LadderGoal, LadderRun, ladder_goal_of, place_of
+from semcal_ros.nodes.acquisition.recorded import read_pictures, read_views
 from semcal_ros.nodes.acquisition.run import (
     ACQUISITION,
     AcquisitionRun,
@@ -78,11 +83,14 @@ from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_worker import (
     CalibrationJob,
     CalibrationProcess,
+    ExtensionJob,
     Stage,
     without_images,
 )
 from semcal_ros.workflows.calibrate import options_for
 from semcal_ros.workflows.check_and_update import check_found, update_found
+from semcal_ros.workflows.conditions import ConditionsComparison
+from semcal_ros.workflows.extend import make_picture
 from semcal_ros.workflows.provenance import describe_views
 
 __all__ = ["CalibrationServer", "main"]
@@ -97,11 +105,11 @@ _PARAMETERS = (
     ),
     replace(
         CALIBRATION,
-        description="Calibration that ~/check and ~/update start from, until one is made here.",
+        description="Calibration that ~/check, ~/update and ~/extend start from, until one is made here.",
     ),
     OUTPUT,
     ParameterDeclaration(
-        "allow_writing", True, "Whether ~/save and ~/acquire may write files.", fixed=True
+        "allow_writing", True, "Whether ~/save, ~/acquire and ~/extend may write files.", fixed=True
     ),
     *ACQUISITION,
 )
@@ -113,6 +121,8 @@ _OTHER_CLOCK_NS = 30 * 10**9
 # Pictures of an acquisition: a slow scan of 4 k x 4 k takes some minutes.
 _PICTURE_S = 600.0
 _POLL_S = 0.1
+
+Goal = TypeVar("Goal", AcquisitionGoal, LadderGoal)
 
 
 @dataclass(frozen=True)
@@ -135,11 +145,12 @@ def _free_folder(wanted: Path) -> Path:
 
 
 class CalibrationServer(StreamNode):
-    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/acquire, ~/cancel, ~/check, ~/update, ~/save, ~/clear;
-    topics ``calibration``, ~/progress, ~/overlay.
+    """Services ~/add_view, ~/calibrate, ~/calibrate_start, ~/acquire, ~/extend, ~/cancel, ~/check, ~/update, ~/save,
+    ~/clear; topics ``calibration``, ~/progress, ~/overlay.
 
     ~/calibrate answers when the calibration is done, ~/calibrate_start when it has begun; views can be added meanwhile
-    for the next one. ~/acquire begins, or goes on with, an acquisition: see :mod:`semcal_ros.nodes.acquisition`.
+    for the next one. ~/acquire begins, or goes on with, an acquisition of a grid, ~/extend that of a ladder: see
+    :mod:`semcal_ros.nodes.acquisition`.
     """
 
     # Frames, the report, parameters, views, a calibration, a call that cancels it, a check, and a microscope's answers.
@@ -160,10 +171,12 @@ class CalibrationServer(StreamNode):
         self._stage: Stage | None = None
         self._beside: threading.Thread | None = None
         # An acquisition, its thread while it runs, and what a person took for its request.
-        self._acquisition: AcquisitionRun | None = None
+        self._acquisition: AcquisitionRun | LadderRun | None = None
         self._acquiring: threading.Thread | None = None
         self._acquisition_wanted = False
-        self._request: ViewRequest | None = None
+        self._request: ViewRequest | PictureRequest | None = None
+        # Of the pictures of a ladder: their stamps, ns, and how they were taken.
+        self._told: dict[str, tuple[int, Conditions, StageReading | None]] = {}
         self._taken_by_hand = ""
         self._recorder: ViewRecorder | None = None
         # What the acquisition is recorded to, and the recording that it went on with.
@@ -196,6 +209,7 @@ class CalibrationServer(StreamNode):
             ("calibrate", self._calibrate, ReentrantCallbackGroup()),
             ("calibrate_start", self._start_calibration, quick),
             ("acquire", self.acquire, quick),
+            ("extend", self.extend, quick),
             ("cancel", self._cancel, MutuallyExclusiveCallbackGroup()),
             ("check", self._check, compared),
             ("update", self._update, compared),
@@ -205,7 +219,7 @@ class CalibrationServer(StreamNode):
                 f"~/{name}",
                 handler,
                 group,
-                self._report_refusal if name == "acquire" else self._report_answer,
+                self._report_refusal if name in ("acquire", "extend") else self._report_answer,
             )
             for name, handler, group in handlers
         ]
@@ -315,11 +329,11 @@ class CalibrationServer(StreamNode):
                 self._taken_by_hand = text
         return text
 
-    def _take_view(self, request: ViewRequest | None) -> str:
-        """Make a view of the newest frame, which must show what was asked for."""
+    def _take_view(self, request: ViewRequest | PictureRequest | None) -> str:
+        """Make use of the newest frame, which must show what was asked for."""
         self._refuse_rivals()
         with self._lock:
-            newest, name = self._newest, f"view {len(self._views)}"
+            newest = self._newest
         frame = None if newest is None else newest.frame
         if newest is None or frame is None or frame.magnification is None:
             raise InvalidValueError(
@@ -329,11 +343,49 @@ class CalibrationServer(StreamNode):
             raise InvalidValueError("the same frame as before", do="wait for the next one")
         if request is not None:
             self._record(newest, frame.magnification)
-            if not is_magnification_of(request, frame.magnification):
+            if not is_same_magnification(request.magnification, frame.magnification):
                 raise CalibrationError(
                     f"a picture at {frame.magnification:g}x",
                     expected=f"{request.magnification:.0f}x",
                 )
+        if isinstance(request, PictureRequest):
+            text = self._take_picture(newest, request)
+        else:
+            text = self._add_view(newest, frame.magnification, request)
+        with self._lock:
+            self._added = frame
+        self.reporter.count_published(frame.stamp_ns)
+        return text
+
+    def _take_picture(self, newest: _Candidate, request: PictureRequest) -> str:
+        """Take a picture for a ladder."""
+        run = self._acquisition
+        assert isinstance(run, LadderRun)
+        picture = self._ladder_picture(newest, f"picture {len(run.taken)}")
+        run.take(request, picture, place_of(newest.stage))
+        told = newest.frame.stamp_ns, newest.conditions, newest.stage
+        with self._lock:
+            self._told[picture.name] = told
+        return f"picture {len(run.taken)} at {picture.magnification:g}x"
+
+    @staticmethod
+    def _ladder_picture(candidate: _Candidate, name: str) -> LadderPicture:
+        frame = candidate.frame
+        assert frame.magnification is not None
+        # A copy: the memory of a message is used again.
+        grey = np.array(to_gray(frame.image, frame.encoding))
+        picture = make_picture(
+            grey, frame.magnification, name, candidate.stage, candidate.conditions
+        )
+        return replace(picture, visit=candidate.visit)
+
+    def _add_view(
+        self, newest: _Candidate, magnification: float, request: ViewRequest | None
+    ) -> str:
+        """Make a view of the grid."""
+        frame = newest.frame
+        with self._lock:
+            name = f"view {len(self._views)}"
         grey = to_gray(frame.image, frame.encoding)
         detection = find_lattice(grey)
         message = Image()
@@ -345,25 +397,21 @@ class CalibrationServer(StreamNode):
         self._overlay.publish(message)
         if isinstance(detection, Rejection):
             raise CalibrationError(
-                f"no grid found at {frame.magnification:g}x: {detection.reason}",
+                f"no grid found at {magnification:g}x: {detection.reason}",
                 expected="an image filled by the chess grid",
             )
         if request is not None and (
             fault := find_picture_fault(grey, detection, request, newest.stage)
         ):
-            raise CalibrationError(f"not usable at {frame.magnification:g}x: {fault}")
-        found = FoundView(name, frame.magnification, grey, detection, newest.stage, newest.visit)
+            raise CalibrationError(f"not usable at {magnification:g}x: {fault}")
+        found = FoundView(name, magnification, grey, detection, newest.stage, newest.visit)
         view = without_images([found])[0]
         with self._lock:
             self._views.append(view)
             self._taken.append((frame.stamp_ns, newest.conditions))
-            self._added = frame
             count = len(self._views)
-        self.reporter.count_published(frame.stamp_ns)
         tilt = None if newest.stage is None else newest.stage.tilt_rad
-        text = (
-            f"view {count} at {frame.magnification:g}x with {counted(len(detection.xy), 'corner')}"
-        )
+        text = f"view {count} at {magnification:g}x with {counted(len(detection.xy), 'corner')}"
         text += "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
         # Who collects views wants to save a calibration, and can still change where.
         return text + (f"; {self._saving}" if count == 1 else "")
@@ -385,7 +433,7 @@ class CalibrationServer(StreamNode):
         running = self._begin()
         self._beside = threading.Thread(target=self._complete_beside, args=(running,), daemon=True)
         self._beside.start()
-        return f"calibrating from {counted(len(running.job.views), 'view')}; ~/progress shows it, ~/cancel ends it"
+        return f"calibrating from {running.job.source}; ~/progress shows it, ~/cancel ends it"
 
     def _complete_beside(self, running: CalibrationProcess) -> None:
         """Report, in place of an answer, how a calibration has ended."""
@@ -412,8 +460,9 @@ class CalibrationServer(StreamNode):
             wanted = self._finish(running, done=done)
         if not wanted:
             raise CalibrationError("cancelled")
-        with self._lock:
-            self._calibrated_views = len(running.job.views)
+        if isinstance(running.job, CalibrationJob):
+            with self._lock:
+                self._calibrated_views = len(running.job.views)
         self._adopt(calibration)
         return result.summary
 
@@ -479,17 +528,41 @@ class CalibrationServer(StreamNode):
             if self._running is not running:
                 return
             self._stage = stage
-        self._report_progress(f"calibrating from {counted(len(running.job.views), 'view')}")
+        self._report_progress(f"calibrating from {running.job.source}")
 
     # -- a calibration that records itself -----------------------------------------------------------
 
     def acquire(self) -> str:
-        """Begin an acquisition, or go on with one; return what was begun, in words."""
+        """Begin an acquisition of a grid, or go on with one; return what was begun, in words."""
+        squares_m, width_m = self.config.squares_m, self.config.display_width_m
+        turn_by = self.parameters["turn_by"]
+        return self._acquire_by(
+            "acquisition",
+            lambda: goal_of(self.parameters, squares_m, width_m),
+            lambda goal: AcquisitionRun(goal, self, self._commands, turn_by, self._still_acquiring),
+        )
+
+    def extend(self) -> str:
+        """Begin a ladder, or go on with one; return what was begun, in words."""
+        return self._acquire_by(
+            "ladder",
+            lambda: ladder_goal_of(self.parameters, self._base()),
+            lambda goal: LadderRun(goal, self, self._commands, self._still_acquiring),
+        )
+
+    def _acquire_by(
+        self,
+        name: str,
+        read_goal: Callable[[], Goal],
+        make_run: Callable[[Goal], AcquisitionRun | LadderRun],
+    ) -> str:
+        """Begin a run that makes an acquisition, or go on with the one that has the same goal."""
         self._refuse_rivals()
         ending = not self._acquisition_wanted and self.acquisition_progress.state in _ENDED
         if self._acquiring is not None and ending:
             # It has said how it ended, and whoever heard that may call at once.
             self._acquiring.join(_LAST_WORD_S)
+        goal = read_goal()
         with self._lock:
             if self.acquiring:
                 raise CalibrationError("an acquisition is running", do="call ~/cancel to end it")
@@ -497,18 +570,11 @@ class CalibrationServer(StreamNode):
                 raise CalibrationError(
                     "a calibration is running", do="wait for its end, or call ~/cancel"
                 )
-            goal = goal_of(self.parameters, self.config.squares_m, self.config.display_width_m)
             run, verb = self._acquisition, "going on"
             ended = run is None or run.discarded or run.progress.state == "done"
             if run is None or ended or run.goal != goal:
-                verb = "begun"
-                run = AcquisitionRun(
-                    goal,
-                    self,
-                    self._commands,
-                    self.parameters["turn_by"],
-                    self._still_acquiring,
-                )
+                verb, run = "begun", make_run(goal)
+                self._told.clear()
             record = self.parameters["record"]
             if record and not self.parameters["allow_writing"]:
                 raise InvalidValueError(
@@ -524,13 +590,13 @@ class CalibrationServer(StreamNode):
             )
         where = "" if before is None else f" with the views of {before}"
         where += "" if path is None else f", recorded to {path}"
-        text = f"acquisition {verb}{where}; ~/progress shows it, ~/cancel ends it"
+        text = f"{name} {verb}{where}; ~/progress shows it, ~/cancel ends it"
         # Before the start: an acquisition that fails at once has the last word.
         self._report_progress(text)
         self._acquiring.start()
         return text
 
-    def _recording_to_resume(self, run: AcquisitionRun) -> Path | None:
+    def _recording_to_resume(self, run: AcquisitionRun | LadderRun) -> Path | None:
         """The recording that a new acquisition goes on with, once."""
         text = self.parameters["resume"]
         if not text or run is self._acquisition:
@@ -546,14 +612,14 @@ class CalibrationServer(StreamNode):
             )
         return path
 
-    def _resume(self, run: AcquisitionRun, path: Path) -> None:
-        """Take over the views of a recording, and record them again, so that the new recording has all."""
+    def _resume(self, run: AcquisitionRun | LadderRun, path: Path) -> None:
+        """Take over the pictures of a recording, and record them again, so that the new recording has all."""
         with self._lock:
             newest = self._newest
 
         def on_frame(frame: RecordedFrame) -> None:
             if not self._still_acquiring():
-                raise CalibrationError("stopped", do="call ~/acquire to go on")
+                raise CalibrationError("stopped", do=f"call {run.service} to go on")
             if self._recorder is not None:
                 known = frame.conditions or Conditions()
                 g, stage = frame.magnification, frame.stage
@@ -561,23 +627,62 @@ class CalibrationServer(StreamNode):
 
         size = None if newest is None else newest.frame.size
         try:
-            taken = read_views(path, self.config, size, run.adopt, on_frame)
+            if isinstance(run, LadderRun):
+                visits = self._resume_ladder(run, path, size, on_frame)
+            else:
+                visits = self._resume_views(run, path, size, on_frame)
         except NODE_ERRORS:
-            # With a part of the views: the next call begins anew.
+            # With a part of them: the next call begins anew.
             run.discarded = True
             raise
         with self._lock:
             self._resumed = path
-            self._views += without_images([one.view for one in taken])
-            self._taken += [(one.stamp_ns, one.conditions) for one in taken]
             # What comes now was set anew.
-            self._first_visit = 1 + max((one.view.visit for one in taken), default=-1)
+            self._first_visit = 1 + max(visits, default=-1)
             if self._newest is not None:
                 self._newest = replace(self._newest, visit=self._newest.visit + self._first_visit)
-        run.report(f"{counted(len(taken), 'view')} taken over from {path}")
+        run.report(f"{counted(len(visits), run.unit)} taken over from {path}")
+
+    def _resume_views(
+        self,
+        run: AcquisitionRun,
+        path: Path,
+        size: tuple[int, int] | None,
+        on_frame: Callable[[RecordedFrame], object],
+    ) -> list[int]:
+        """Take over views of a grid; return their visits."""
+        taken = read_views(path, self.config, size, run.adopt, on_frame)
+        with self._lock:
+            self._views += without_images([one.view for one in taken])
+            self._taken += [(one.stamp_ns, one.conditions) for one in taken]
+        return [one.view.visit for one in taken if one.view.visit is not None]
+
+    def _resume_ladder(
+        self,
+        run: LadderRun,
+        path: Path,
+        size: tuple[int, int] | None,
+        on_frame: Callable[[RecordedFrame], object],
+    ) -> list[int]:
+        """Take over pictures of a ladder; return their visits."""
+
+        def adopt(frame: RecordedFrame) -> bool:
+            known = frame.conditions or Conditions()
+            name = f"picture {len(run.taken)}"
+            grey = to_gray(frame.visible, frame.encoding)
+            picture = make_picture(grey, frame.magnification, name, frame.stage, known)
+            if not run.adopt(picture, place_of(frame.stage)):
+                return False
+            with self._lock:
+                self._told[name] = frame.stamp_ns, known, frame.stage
+            return True
+
+        visits = read_pictures(path, self.config, size, adopt, on_frame)
+        run.number_visits(visits)
+        return visits
 
     def _acquire_beside(
-        self, run: AcquisitionRun, recorder: ViewRecorder | None, resumed: Path | None
+        self, run: AcquisitionRun | LadderRun, recorder: ViewRecorder | None, resumed: Path | None
     ) -> None:
         """Run an acquisition, and say how it has ended."""
         level, state = DiagnosticLevel.OK, "done"
@@ -587,17 +692,12 @@ class CalibrationServer(StreamNode):
                 try:
                     if resumed is not None:
                         self._resume(run, resumed)
-                    ended = run.run()
+                    text = run.run()
                 except NODE_ERRORS as error:
                     # What was recorded is kept: the error is told, not raised.
                     text = " ".join(str(error).split())
                     level = DiagnosticLevel.WARN
                     state = "failed" if self._still_acquiring() else "stopped"
-                else:
-                    text = (
-                        f"{ended.reason}: nm per px known to {100.0 * ended.largest:.3f} % at {ended.at:.0f}x, the "
-                        "worst, repeatability aside; ~/save writes the calibration"
-                    )
         except NODE_ERRORS as error:
             text, level, state = " ".join(str(error).split()), DiagnosticLevel.WARN, "failed"
         finally:
@@ -607,7 +707,8 @@ class CalibrationServer(StreamNode):
         run.progress = replace(run.progress, state=state, text=text)
         if self.context.ok():
             self._report_progress(f"acquisition {state}: {text}", level)
-            (self.reporter.info if state == "done" else self.reporter.warn)(f"~/acquire: {text}")
+            told = f"{run.service}: {text}"
+            (self.reporter.info if state == "done" else self.reporter.warn)(told)
 
     @property
     def has_picture(self) -> bool:
@@ -633,6 +734,17 @@ class CalibrationServer(StreamNode):
             else self._acquisition.progress
         )
 
+    @property
+    def acquisition_reached(self) -> bool:
+        """Whether an acquisition has met what was asked for."""
+        run = self._acquisition
+        return run is not None and run.progress.state == "done" and run.reached
+
+    @property
+    def _service(self) -> str:
+        """What goes on with the acquisition."""
+        return "~/acquire" if self._acquisition is None else self._acquisition.service
+
     def _still_acquiring(self) -> bool:
         return self._acquisition_wanted and self.context.ok()
 
@@ -650,7 +762,7 @@ class CalibrationServer(StreamNode):
             )
 
     def wait_for_pictures(self, count: int) -> None:
-        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
         with self._lock:
             wanted = self._pictures + count
         asked_ns = self.get_clock().now().nanoseconds
@@ -675,22 +787,55 @@ class CalibrationServer(StreamNode):
         found = find_lattice(to_gray(newest.frame.image, newest.frame.encoding))
         return None if isinstance(found, Rejection) else found
 
-    def take(self, request: ViewRequest) -> str:
-        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+    def newest_picture(self) -> LadderPicture | None:
+        """See :class:`~semcal_ros.nodes.acquisition.ladder.LadderTaker`."""
+        with self._lock:
+            newest = self._newest
+        return None if newest is None else self._ladder_picture(newest, "")
+
+    def extend_calibration(self, run: LadderRun) -> str:
+        """See :class:`~semcal_ros.nodes.acquisition.ladder.LadderTaker`."""
+        self._refuse_rivals()
+        calibration = run.goal.calibration
+        pictures = tuple(one.picture for one in run.taken)
+        compared = ConditionsComparison(calibration, scans_may_turn=True)
+        with self._lock:
+            self._request = None
+            told = [self._told[picture.name] for picture in pictures]
+            for _, conditions, _ in told:
+                compared.add(conditions)
+            seen = {
+                picture.name: (conditions, stage)
+                for picture, (_, conditions, stage) in zip(pictures, told, strict=True)
+            }
+            notes = compared.notes
+            if doubt := self._position.doubt:
+                # As from a recording: small angles in degrees have passed for radians.
+                pictures = tuple(replace(picture, scan_rotation_rad=None) for picture in pictures)
+                notes = (*notes, f"stage: {doubt} looks like degrees: the stage is not used")
+            origin = describe_views(self.config, seen, [stamp_ns for stamp_ns, _, _ in told])
+            running = CalibrationProcess(
+                ExtensionJob(calibration, pictures, self.config, origin, notes)
+            )
+            self._running = running
+        return self._complete(running)
+
+    def take(self, request: ViewRequest | PictureRequest) -> str:
+        """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
         try:
             return self._take_view(request)
         except InvalidValueError as error:
             raise CalibrationError(str(error)) from error
 
-    def wait_for_view(self, request: ViewRequest) -> str:
-        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+    def wait_for_view(self, request: ViewRequest | PictureRequest) -> str:
+        """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
         with self._lock:
             self._request, self._taken_by_hand = request, ""
         self._wait_until(lambda: bool(self._taken_by_hand), CalibrationError("no view"), math.inf)
         return self._taken_by_hand
 
     def stage(self) -> StageReading | None:
-        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
         with self._lock:
             return None if self._newest is None else self._newest.stage
 
@@ -706,7 +851,7 @@ class CalibrationServer(StreamNode):
         return calibration
 
     def show(self, progress: Progress) -> None:
-        """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
+        """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
         self._report_progress(progress.text)
 
     def _wait_until(
@@ -718,7 +863,7 @@ class CalibrationServer(StreamNode):
         end_s = time.monotonic() + limit_s
         while not condition():
             if not self._still_acquiring():
-                raise CalibrationError("stopped", do="call ~/acquire to go on")
+                raise CalibrationError("stopped", do=f"call {self._service} to go on")
             if time.monotonic() > end_s:
                 raise late
             time.sleep(_POLL_S)
@@ -731,37 +876,39 @@ class CalibrationServer(StreamNode):
         if acquiring:
             if running is not None:
                 running.cancel()
-            return "the acquisition ends as soon as nothing moves; ~/acquire goes on with it"
+            return f"the acquisition ends as soon as nothing moves; {self._service} goes on with it"
         if running is None:
             raise CalibrationError("no calibration is running")
         running.cancel()
-        job = running.job
-        return (
-            f"cancelled the {job.options.method} calibration from {counted(len(job.views), 'view')}"
-            f" after {running.elapsed_s:.1f} s"
-        )
+        return f"cancelled the {running.job.title} after {running.elapsed_s:.1f} s"
 
     def _compared(self) -> tuple[Calibration, tuple[FoundView, ...], Provenance]:
         """The calibration that is checked or renewed, the views that say so, and their origin."""
         self._refuse_rivals()
         with self._lock:
-            calibration = self._calibration
             views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
             if self._position.doubt:
                 views = tuple(replace(v, stage=None) for v in views)
             origin = self._describe(views)
         if not views:
             raise CalibrationError("no usable view yet", do="call ~/add_view first")
-        if calibration is None:
-            path = self.parameters["calibration"]
-            if not path:
-                raise InvalidValueError(
-                    "no calibration to compare with",
-                    expected="the parameter calibration to name a file, or one made here",
-                    do="set it, or call ~/calibrate",
-                )
-            calibration = Calibration.load(self.parameters.allowed_path(path))
+        calibration = self._base()
         return calibration, views, origin
+
+    def _base(self) -> Calibration:
+        """The calibration that was made here, else that of the file."""
+        with self._lock:
+            calibration = self._calibration
+        if calibration is not None:
+            return calibration
+        path = self.parameters["calibration"]
+        if not path:
+            raise InvalidValueError(
+                "no calibration to begin with",
+                expected="the parameter calibration to name a file, or one made here",
+                do="set it, or call ~/calibrate",
+            )
+        return Calibration.load(self.parameters.allowed_path(path))
 
     def _check(self) -> str:
         calibration, views, _ = self._compared()

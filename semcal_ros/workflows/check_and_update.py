@@ -261,7 +261,7 @@ def _see(
     conditions = ConditionsComparison(model)
 
     def note_frame(name: str, frame: RecordedFrame) -> None:
-        conditions.add(frame)
+        conditions.add(frame.conditions)
         frames[name] = replace(frame, image=frame.image[:0])
 
     with open_source(source, microscope) as opened:

@@ -16,12 +16,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.wording import printable
-from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 
 __all__ = ["ConditionsComparison"]
@@ -37,16 +36,20 @@ class ConditionsComparison:
     ----------
     calibration
         None: nothing is compared.
+    scans_may_turn
+        Whether a rotation of the scan is no other condition.
     """
 
-    def __init__(self, calibration: Calibration | None) -> None:
+    def __init__(self, calibration: Calibration | None, *, scans_may_turn: bool = False) -> None:
         self._calibration = calibration
+        self._scans_may_turn = scans_may_turn
         self._last: Conditions | None = None
         self._found: dict[str, bool] = {}
 
-    def add(self, frame: RecordedFrame) -> None:
+    def add(self, conditions: Conditions | None) -> None:
         """Take the conditions of a frame."""
-        conditions = frame.conditions
+        if conditions is not None and self._scans_may_turn:
+            conditions = replace(conditions, scan_rotation_rad=None)
         if self._calibration is None or conditions is None or conditions == self._last:
             return
         self._last = conditions

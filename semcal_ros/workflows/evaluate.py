@@ -150,7 +150,7 @@ def evaluate(
     ):
         advance = count_frames(on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(
-            named_frames(opened, lambda _, frame: conditions.add(frame)),
+            named_frames(opened, lambda _, frame: conditions.add(frame.conditions)),
             on_progress=advance,
             workers=workers if workers.elsewhere else None,
             keep_images=False,

@@ -16,15 +16,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.ladder.extend import LadderPicture, LadderResult, extend_calibration
+from semcal_ros.core.arrays import AnyImage
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.files.recordings import RecordedFrame
+from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -39,7 +43,14 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.provenance import describe_provenance
 
-__all__ = ["RecordingExtension", "SeenLadder", "extend", "read_ladder"]
+__all__ = [
+    "RecordingExtension",
+    "SeenLadder",
+    "extend",
+    "extend_by_pictures",
+    "make_picture",
+    "read_ladder",
+]
 
 # Digits of a magnification: the same setting is the same number, however a file rounds it.
 _DIGITS = 9
@@ -103,12 +114,41 @@ def extend(
     model = require_calibration(calibration)
     microscope = resolve_config(config, model)
     seen = read_ladder(source, microscope, model, on_progress)
-    result = extend_calibration(
-        model, seen.pictures, timing=microscope.scan, on_progress=on_progress
-    )
     provenance = describe_provenance(source, microscope, seen.frames)
+    return extend_by_pictures(
+        model, seen.pictures, microscope, provenance, notes=seen.notes, on_progress=on_progress
+    )
+
+
+def extend_by_pictures(
+    calibration: Calibration,
+    pictures: Sequence[LadderPicture],
+    config: MicroscopeConfig,
+    provenance: Provenance,
+    *,
+    notes: tuple[str, ...] = (),
+    on_progress: OnProgress = ignore_progress,
+) -> RecordingExtension:
+    """Extend a calibration by pictures that are read already; arguments and errors as of :func:`extend`.
+
+    Parameters
+    ----------
+    calibration
+        The calibration.
+    pictures
+        Those of the ladder, in the order in which they were taken.
+    config
+        The settings in effect.
+    provenance
+        Where the pictures come from.
+    notes
+        Notes for the user about them.
+    on_progress
+        As there.
+    """
+    result = extend_calibration(calibration, pictures, timing=config.scan, on_progress=on_progress)
     extended = Calibration.from_model(replace(result.model, provenance=provenance))
-    return RecordingExtension(extended, result, seen.notes)
+    return RecordingExtension(extended, result, notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,32 +173,45 @@ def read_ladder(
     SemcalError
         If the recording cannot be read.
     """
-    conditions = ConditionsComparison(calibration)
+    # The scans of a ladder are turned on purpose.
+    conditions = ConditionsComparison(calibration, scans_may_turn=True)
     frames: dict[str, RecordedFrame] = {}
     pictures = []
     with open_source(source, microscope) as opened:
         advance = count_frames(on_progress, "reading", opened.frame_count)
         for index, frame in enumerate(opened.frames()):
             name = frame.file_name or f"frame {index}"
-            conditions.add(_without_turn(frame))
-            pictures.append(_picture(frame, name))
+            conditions.add(frame.conditions)
+            grey = to_gray(frame.visible, frame.encoding)
+            pictures.append(
+                make_picture(grey, frame.magnification, name, frame.stage, frame.conditions)
+            )
             frames[name] = replace(frame, image=frame.image[:0])
             advance(1)
         notes = (*opened.notes, *conditions.notes)
     return SeenLadder(tuple(pictures), frames, notes)
 
 
-def _without_turn(frame: RecordedFrame) -> RecordedFrame:
-    """The frame as the conditions of a grid's recording are told: the scans of a ladder are turned on purpose."""
-    if frame.conditions is None:
-        return frame
-    return replace(frame, conditions=replace(frame.conditions, scan_rotation_rad=None))
+def make_picture(
+    grey: AnyImage,
+    magnification: float,
+    name: str,
+    stage: StageReading | None,
+    conditions: Conditions | None,
+) -> LadderPicture:
+    """A picture of a ladder, with the rotation of the scan that the stage or the conditions tell.
 
-
-def _picture(frame: RecordedFrame, name: str) -> LadderPicture:
-    grey = np.asarray(to_gray(frame.visible, frame.encoding), dtype=np.float32)
-    turn = None if frame.stage is None else frame.stage.scan_rotation_rad
-    if turn is None and frame.conditions is not None:
-        turn = frame.conditions.scan_rotation_rad
-    magnification = float(f"{frame.magnification:.{_DIGITS}g}")
-    return LadderPicture(grey, magnification, name, turn)
+    Parameters
+    ----------
+    grey
+        (h, w) grey levels without a data bar.
+    magnification, name
+        Of the picture.
+    stage, conditions
+        What was told of it.
+    """
+    turn = None if stage is None else stage.scan_rotation_rad
+    if turn is None and conditions is not None:
+        turn = conditions.scan_rotation_rad
+    rounded = float(f"{magnification:.{_DIGITS}g}")
+    return LadderPicture(grey, rounded, name, turn)

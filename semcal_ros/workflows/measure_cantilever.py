@@ -316,7 +316,7 @@ def _read(
             advance = count_frames(on_progress, "reading", opened.frame_count)
             for frame in opened.frames():
                 advance(1)
-                conditions.add(frame)
+                conditions.add(frame.conditions)
                 label = f"{frame.magnification:.6g}"
                 if (path, label) not in found:
                     camera = camera_for(frame, model, microscope)

@@ -183,7 +183,7 @@ def measure_relief(
         frames = list(opened.frames())
         conditions = ConditionsComparison(model)
         for frame in frames:
-            conditions.add(frame)
+            conditions.add(frame.conditions)
         notes = [*opened.notes, *conditions.notes]
     if len({frame.magnification for frame in frames}) > 1:
         raise InvalidValueError(

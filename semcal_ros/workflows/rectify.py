@@ -220,7 +220,7 @@ def rectify(
 
         def orders() -> Iterator[tuple[object, ...]]:
             for followed in _follow(opened, model, microscope, follower):
-                conditions.add(followed.frame)
+                conditions.add(followed.frame.conditions)
                 under_way.append(followed)
                 raster = None if followed.update is None else followed.update.raster
                 image = followed.frame.image

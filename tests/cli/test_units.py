@@ -84,6 +84,16 @@ def test_bare_tilts_are_degrees(command: click.Command, text: str) -> None:
         ),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--tilts", ""), "is not an angle"),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--resume", "gone"), "does not exist"),
+        (("acquire", "-o", "c.yaml"), "neither --range nor --extend"),
+        (("acquire", "-o", "c.yaml", "--range", "1,2", "--extend", "c"), "--range and --extend"),
+        (("acquire", "-o", "c.yaml", "--extend", "c.yaml"), "--extend without --to"),
+        (("acquire", "-o", "c.yaml", "--range", "1,2", "--to", "9x"), "--to without --extend"),
+        (("acquire", "-o", "c.yaml", "--extend", "c", "--to", "much"), "not a magnification"),
+        (
+            ("acquire", "-o", "c.yaml", "--extend", "c", "--to", "9x", "--tilts", "0,9"),
+            "--tilts with --extend",
+        ),
+        (("acquire", "-o", "c.yaml", "--extend", "gone", "--to", "9x"), "No such file"),
         (
             ("acquire", "-o", "c.yaml", "--range", "1,2", "--no-record", "--record", "r"),
             "--record and --no-record",

@@ -30,9 +30,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 
+from semcal_ros import extend
 from semcal_ros.calibration import Calibration
 from semcal_ros.synthetic import preset
 from semcal_ros.workflows.calibrate import calibrate_recording
+from tests.helpers.calibrations import calibrated
 from tests.helpers.project import ROOT
 from tests.helpers.ros_process import LATCHED, RELIABLE, Peer, running
 
@@ -141,6 +143,62 @@ def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl
 
 
 @pytest.mark.long
+def test_semcal_acquire_extends_a_calibration_and_goes_on_after_ctrl_c(tmp_path: Path) -> None:
+    """The same with a ladder over gold: right within what it states beyond the grid, and a recording of it."""
+    grid, output, views = tmp_path / "cal.yaml", tmp_path / "new.yaml", tmp_path / "new_views"
+    Calibration.from_model(calibrated("jsm820").model).save(grid)
+    command = [sys.executable, "-m", "semcal_ros", "acquire", "-o", str(output)]
+    command += ["--config", "virtual_sem", "--microscope", "virtual_sem"]
+    command += ["--extend", str(grid), "--to", "14000x"]
+    options: dict[str, Any] = {
+        "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+        "text": True,
+    }
+    with running("virtual_sem", {**SEM, "specimen": "gold", "drift": "slow"}):
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options
+        ) as first:
+            assert first.stdout is not None
+            said = ""
+            # The first magnification, and a part of the second one.
+            while not re.search(r"^5/16: ", said, re.MULTILINE):
+                line = first.stdout.readline()
+                assert line, said
+                said += line
+            first.send_signal(signal.SIGINT)
+            said += first.stdout.read()
+        assert first.returncode == 1, said
+        assert said.splitlines()[0].startswith(f"ladder begun, recorded to {views}")
+        assert re.search(rf"ended with [56] pictures; .* --resume {views} goes on$", said.rstrip())
+        assert not output.exists()
+        done = subprocess.run(
+            [*command, "--resume", str(views)],
+            capture_output=True,
+            timeout=200.0,
+            check=False,
+            **options,
+        )
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    assert re.fullmatch(rf"[56]/16: [56] pictures taken over from {views}", lines[1])
+    assert "extended to 100x to 14000x by 16 pictures" in lines[-3]
+    assert lines[-1].startswith(f"saved to {output}")
+    found, truth = Calibration.load(output), preset("jsm820")
+    for g in (11000.0, 14000.0):
+        camera = found.at(g)
+        wanted = truth.with_image_size(*found.image_size).camera_at(g)
+        errors = np.subtract(camera.pixel_size_m, wanted.pixel_size_m)
+        assert np.all(np.abs(errors) < 3.5 * np.array(camera.pixel_size_sigma_m))
+        assert max(camera.pixel_size_sigma_m) < 4e-3 * camera.pixel_size_m[0]
+    # The recording has all pictures, and gives the same as a command.
+    again = extend(grid, tmp_path / "new_views_2", config="virtual_sem")
+    assert sum(step.pictures for step in again.result.steps) >= 16
+    np.testing.assert_allclose(
+        again.calibration.at(14000.0).pixel_size_m, found.at(14000.0).pixel_size_m, rtol=2e-3
+    )
+
+
+@pytest.mark.long
 def test_a_grid_that_a_tilt_carries_away_is_followed(peer: Peer) -> None:
     """A grid of 100 um on a stage whose axis is 0.5 mm off: 40 degrees carry it by 117 um, out of the field."""
     scene = {
@@ -242,8 +300,12 @@ def test_what_goes_wrong_ends_it_with_the_reason_and_nothing_moves_any_more(
         assert "acquisition" not in peer.state(SERVER).get("message", "")
 
 
-def test_a_range_is_needed(peer: Peer) -> None:
+def test_what_is_to_be_reached_must_be_said(peer: Peer) -> None:
     with running("virtual_sem", SEM), running("calibration_server", {"config": "virtual_sem"}):
-        answer = peer.trigger(f"{SERVER}/acquire")
-        assert not answer.success
-        assert "no range of magnifications" in answer.message
+        for service, said in (
+            ("acquire", "no range of magnifications"),
+            ("extend", "no calibration to begin with"),
+        ):
+            answer = peer.trigger(f"{SERVER}/{service}")
+            assert not answer.success
+            assert said in answer.message

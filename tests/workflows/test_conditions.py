@@ -16,12 +16,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from semcal_ros import Calibration
 from semcal_ros.core.camera.provenance import Provenance
-from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.conditions import ConditionsComparison
 from tests.helpers.calibrations import DEFAULT, calibrated
@@ -35,10 +33,18 @@ MADE = {
 
 def notes(calibration: Calibration | None, *seen: Conditions | None) -> tuple[str, ...]:
     comparison = ConditionsComparison(calibration)
-    frame = RecordedFrame(np.zeros((2, 2), np.uint8), 0, 0, 1000.0, "sem", "mono8")
     for own in seen:
-        comparison.add(replace(frame, conditions=own))
+        comparison.add(own)
     return comparison.notes
+
+
+def test_a_scan_that_turns_on_purpose_is_no_other_condition(calibration: Calibration) -> None:
+    made = replace(calibration.provenance, conditions={**MADE, "scan_rotation_rad": (0.0, 0.0)})
+    unturned = Calibration.from_model(replace(calibration, provenance=made))
+    for may_turn, count in ((False, 1), (True, 0)):
+        comparison = ConditionsComparison(unturned, scans_may_turn=may_turn)
+        comparison.add(Conditions(scan_rotation_rad=1.57))
+        assert len(comparison.notes) == count
 
 
 @pytest.fixture(scope="module")

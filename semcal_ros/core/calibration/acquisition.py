@@ -47,11 +47,13 @@ __all__ = [
     "AcquisitionGoal",
     "Proposal",
     "ViewRequest",
+    "find_exposure_fault",
     "find_picture_fault",
     "find_stage_move",
     "grid_is_centred",
     "image_from_stage",
     "is_magnification_of",
+    "is_same_magnification",
     "lattice_shift",
     "plan_survey",
     "propose_visits",
@@ -387,9 +389,14 @@ def propose_visits(
     return Proposal(requests, plan.largest, plan.at, plan.largest <= goal.target, reason)
 
 
+def is_same_magnification(wanted: float, magnification: float) -> bool:
+    """Return whether a magnification is the one that was asked for, as far as a display tells it."""
+    return abs(magnification / wanted - 1.0) <= _MAGNIFICATION_OFF
+
+
 def is_magnification_of(request: ViewRequest, magnification: float) -> bool:
     """Return whether a magnification is the one of a request, as far as a display tells it."""
-    return abs(magnification / request.magnification - 1.0) <= _MAGNIFICATION_OFF
+    return is_same_magnification(request.magnification, magnification)
 
 
 def request_of_picture(
@@ -423,6 +430,23 @@ def request_of_picture(
     )
 
 
+def find_exposure_fault(image: AnyImage) -> str:
+    """Say whether much of a picture is black or white; empty if not.
+
+    Parameters
+    ----------
+    image
+        (h, w) grey values.
+    """
+    grey = np.asarray(image, dtype=np.float64)
+    largest = 2.0 ** (8 * image.dtype.itemsize) - 1.0 if image.dtype.kind == "u" else math.inf
+    dark, bright = float(np.mean(grey <= 0.0)), float(np.mean(grey >= largest))
+    if max(dark, bright) <= _SATURATED:
+        return ""
+    share, end = max((dark, "black"), (bright, "white"))
+    return f"{100.0 * share:.0f} % of the pixels are {end}: change brightness or contrast"
+
+
 def find_picture_fault(
     image: AnyImage,
     detection: LatticeDetection,
@@ -449,12 +473,8 @@ def find_picture_fault(
                 f"the stage is tilted by {math.degrees(stage.tilt_rad):.1f} degrees"
                 f" instead of {math.degrees(request.tilt_rad):.1f}"
             )
-    grey = np.asarray(image, dtype=np.float64)
-    largest = 2.0 ** (8 * image.dtype.itemsize) - 1.0 if image.dtype.kind == "u" else math.inf
-    dark, bright = float(np.mean(grey <= 0.0)), float(np.mean(grey >= largest))
-    if max(dark, bright) > _SATURATED:
-        share, end = max((dark, "black"), (bright, "white"))
-        return f"{100.0 * share:.0f} % of the pixels are {end}: change brightness or contrast"
+    if fault := find_exposure_fault(image):
+        return fault
     if detection.blur_px > _BLURRED * detection.spacing_px:
         return f"out of focus: edges are blurred by {detection.blur_px:.1f} px"
     spanned = np.ptp(detection.xy, axis=0) / np.array(detection.image_size)

@@ -35,7 +35,7 @@ from semcal_ros.core.calibration.estimator.trust_region import (
     Step,
     descend,
 )
-from semcal_ros.core.errors import CalibrationError
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.residuals import Link, pair_rows, pair_values
 from semcal_ros.core.ladder.unknowns import (
     POSE_SIZE,
@@ -45,7 +45,15 @@ from semcal_ros.core.ladder.unknowns import (
     slope_sigma,
 )
 
-__all__ = ["DriftSpread", "LadderFit", "add_up", "adjust", "prior_information", "share_noise"]
+__all__ = [
+    "SETTLED_DRIFT_PX",
+    "DriftSpread",
+    "LadderFit",
+    "add_up",
+    "adjust",
+    "prior_information",
+    "share_noise",
+]
 
 # Gauss-Newton steps; from the poses of the correspondences five are enough.
 _ITERATIONS, _TOLERANCE = 30, 1e-9
@@ -53,9 +61,11 @@ _ITERATIONS, _TOLERANCE = 30, 1e-9
 # that has settled does, and more than a thirtieth of the picture is no drift.
 _FIRST_DRIFT_PX, _LEAST_DRIFT_PX, _MOST_DRIFT = 0.5, 0.02, 0.03
 _SPREADS, _SPREAD_ROUNDS = 12, 3
-# A spread that a settled specimen may have, px, and by how much a larger one must lower the variance of the residuals
-# to be believed: what else is not in the model lowers it by a few per cent.
-_SETTLED_DRIFT_PX, _UNEXPLAINED = 1.0, 1.1
+#: A spread of the drift that a settled specimen may have, px.
+SETTLED_DRIFT_PX = 1.0
+# By how much a larger one must lower the variance of the residuals to be believed: what else is not in the model lowers
+# it by a few per cent.
+_UNEXPLAINED = 1.1
 # Scans whose angle differs by less are not turned, rad.
 _TURNED_RAD = 0.5
 # Vibration stretches a frame by this at any magnification, px.
@@ -207,9 +217,9 @@ def adjust(
         If the adjustment does not converge.
     """
     fit = _adjust(setup, state, links, on_progress, _MOST_DRIFT * setup.image_size[1])
-    if max(fit.drift.steady_px, fit.drift.change_px) <= _SETTLED_DRIFT_PX:
+    if max(fit.drift.steady_px, fit.drift.change_px) <= SETTLED_DRIFT_PX:
         return fit
-    settled = _adjust(setup, state, links, on_progress, _SETTLED_DRIFT_PX)
+    settled = _adjust(setup, state, links, on_progress, SETTLED_DRIFT_PX)
     is_as_good = settled.variance_factor <= _UNEXPLAINED * fit.variance_factor
     return settled if is_as_good and len(settled.kept) >= len(fit.kept) else fit
 
@@ -337,10 +347,14 @@ def _descend(
     information = prior_information(setup, drift, jumps)
 
     def cost_of(candidate: LadderState) -> float:
-        with np.errstate(all="ignore"):
-            total = sum(
-                link.share * float(np.sum(pair_values(candidate, link) ** 2)) for link in links
-            )
+        try:
+            with np.errstate(all="ignore"):
+                total = sum(
+                    link.share * float(np.sum(pair_values(candidate, link) ** 2)) for link in links
+                )
+        except InvalidValueError:
+            # A step to where there is no camera.
+            return float("inf")
         prior = float(candidate.values**2 @ information)
         cost = 0.5 * (total + prior)
         return cost if np.isfinite(cost) else float("inf")

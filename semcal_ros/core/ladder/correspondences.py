@@ -56,6 +56,7 @@ __all__ = [
     "PairFailure",
     "Prepared",
     "SmoothMap",
+    "locate_picture",
     "match_pictures",
 ]
 
@@ -281,15 +282,10 @@ def match_pictures(
     search
         Whether to search over all shifts; otherwise the prediction is right to two pixels.
     """
-    for picture, name in ((first, "first"), (second, "second")):
-        if picture.is_featureless:
-            return Rejection(PairFailure.FEATURELESS, f"the {name} picture shows noise only")
-    smooth = _fit_prediction(predict, first.size)
-    if search:
-        found = _search(first, second, smooth)
-        if isinstance(found, Rejection):
-            return found
-        smooth = found
+    found = _begin(first, second, predict, search=search)
+    if isinstance(found, Rejection):
+        return found
+    smooth = found
     for factor in _COARSE_FACTORS:
         for _ in range(_COARSE_PASSES):
             blocks = _measure_blocks(first, second, smooth, factor)
@@ -310,6 +306,26 @@ def match_pictures(
         smooth = _follow(smooth, step)
     assert blocks is not None
     return _conclude(blocks, step, smooth)
+
+
+def locate_picture(
+    first: Prepared, second: Prepared, predict: Callable[[Array], Array]
+) -> SmoothMap | Rejection[PairFailure]:
+    """Find to a pixel where the second picture shows what the first one does; arguments as of :func:`match_pictures`.
+
+    It asks for less in common: whether both show one place, not how each part of it is displaced.
+    """
+    return _begin(first, second, predict, search=True)
+
+
+def _begin(
+    first: Prepared, second: Prepared, predict: Callable[[Array], Array], *, search: bool
+) -> SmoothMap | Rejection[PairFailure]:
+    for picture, name in ((first, "first"), (second, "second")):
+        if picture.is_featureless:
+            return Rejection(PairFailure.FEATURELESS, f"the {name} picture shows noise only")
+    smooth = _fit_prediction(predict, first.size)
+    return _search(first, second, smooth) if search else smooth
 
 
 def _fit_prediction(predict: Callable[[Array], Array], size: tuple[int, int]) -> SmoothMap:

@@ -26,22 +26,35 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise, product
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Image, check_positive
+from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
 from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
-from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
-from semcal_ros.core.ladder.adjustment import LadderFit, adjust
-from semcal_ros.core.ladder.correspondences import (
-    Correspondences,
-    PairFailure,
-    Prepared,
-    match_pictures,
+from semcal_ros.core.errors import CalibrationError, InvalidValueError
+from semcal_ros.core.ladder.adjustment import SETTLED_DRIFT_PX, LadderFit, adjust
+from semcal_ros.core.ladder.agreement import (
+    FLIPS,
+    SURE,
+    Flip,
+    Misstatement,
+    find_misstatement,
+    flip_match,
+    measure_disagreement,
+    minus_log_evidence,
+)
+from semcal_ros.core.ladder.matching import (
+    LadderPicture,
+    Match,
+    RejectedPair,
+    Turns,
+    calibrated_xy,
+    check_connected,
+    check_steps,
+    compare_turns,
+    match_all,
 )
 from semcal_ros.core.ladder.residuals import Link, camera_of, make_link, pair_rows
 from semcal_ros.core.ladder.unknowns import (
@@ -56,12 +69,9 @@ from semcal_ros.core.ladder.unknowns import (
 from semcal_ros.core.wording import counted
 
 __all__ = [
-    "LARGEST_STEP",
     "LadderMeasurement",
-    "LadderPicture",
     "LadderResult",
     "LadderStep",
-    "RejectedPair",
     "check_fit",
     "creep_of",
     "describe_ladder",
@@ -70,14 +80,9 @@ __all__ = [
     "find_unrest",
     "make_model",
     "measure_ladder",
+    "scale_of_pictures",
 ]
 
-#: Largest ratio of neighbouring magnifications of a ladder: at 1.6 the upper picture covers 39 % of the lower one.
-LARGEST_STEP = 1.6
-# What rounding of a magnification adds.
-_ROUNDING = 1.02
-# Scans of unknown rotation are tried at these.
-_QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 # Slope of a specimen that is not flat any more: 5 degrees, ten times that of one that is mounted flat.
 _STEEPEST_RAD = 0.0873
 # Residuals of twice their sigma are a model that does not fit, or pictures that do not show one plane.
@@ -88,43 +93,10 @@ _LEAST_USED = 0.5
 # A creep of so many sigmas is one of 16 000 by chance; what adds up to more than this over a ladder need not be as
 # steady as it is taken to be.
 _CREEP_SIGMAS, _MOST_CREEP = 4.0, 5e-3
+# Pictures that are named.
+_MOST_NAMED = 3
 # A turn by less than this is none of the scan, rad; and a shift by less than this part of the field is none.
 _TURNED_RAD, _SHIFTED = 0.5, 0.08
-
-
-@dataclass(frozen=True, eq=False)
-class LadderPicture:
-    """A picture of the specimen.
-
-    Attributes
-    ----------
-    image
-        (h, w) grey levels, without a data bar.
-    magnification
-        Its magnification.
-    name
-        For messages.
-    scan_rotation_rad
-        By how much the scan was turned, where that is known: a positive angle turns the specimen in the picture from
-        +x to +y.
-    visit
-        Number of the stretch between which the magnification was not set; None: it changes with the magnification.
-    """
-
-    image: Image
-    magnification: float
-    name: str = ""
-    scan_rotation_rad: float | None = None
-    visit: int | None = None
-
-
-@dataclass(frozen=True)
-class RejectedPair:
-    """Two pictures that were not matched, or do not agree with the others."""
-
-    first: str
-    second: str
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -184,15 +156,6 @@ class LadderResult:
     drift_px: float
     variance_factor: float
     weaknesses: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Match:
-    """Two pictures that show the same: by their numbers, the one with the larger pixels first."""
-
-    first: int
-    second: int
-    found: Correspondences
 
 
 def extend_calibration(
@@ -264,6 +227,8 @@ class LadderMeasurement:
         Pairs and names of pictures that were not used.
     numbers
         Which of the pictures that were given are used.
+    notes
+        What contradicts what is stated of the pictures, in sentences.
     """
 
     setup: LadderSetup
@@ -273,6 +238,7 @@ class LadderMeasurement:
     rejected: tuple[RejectedPair, ...]
     unused: tuple[str, ...]
     numbers: tuple[int, ...]
+    notes: tuple[str, ...] = ()
 
 
 def measure_ladder(
@@ -281,35 +247,196 @@ def measure_ladder(
     *,
     timing: ScanTiming | None = None,
     on_progress: Callable[[str, int, int | None], object] = lambda _stage, _done, _total: None,
+    calibrated: bool = True,
 ) -> LadderMeasurement:
-    """Match the pictures of a ladder and adjust them; arguments and errors as of :func:`extend_calibration`."""
-    scale = _scale_of_pictures(model, pictures)
-    places = _places(pictures)
-    setup = make_setup(model, tuple(places), (model.image_width, model.image_height))
-    matches, rejected = _match_all(setup, pictures, scale, on_progress)
-    used, unused = _check_connected(pictures, matches, rejected)
-    number_of = {number: k for k, number in enumerate(used)}
-    setup = make_setup(
-        model, tuple(places[k] for k in used), (model.image_width, model.image_height)
-    )
-    matches = [match for match in matches if match.first in number_of]
-    state = _start(setup, matches, number_of, scale)
+    """Match the pictures of a ladder and adjust them.
+
+    Parameters
+    ----------
+    model, pictures, timing, on_progress
+        As of :func:`extend_calibration`; its errors.
+    calibrated
+        Whether the model is a calibration, with which the pictures must agree, and not a mere prior.
+    """
+    scale = scale_of_pictures(model, pictures)
+    places = tuple(_places(pictures))
+    size = model.image_width, model.image_height
+    setup = make_setup(model, places, size)
+    matches, rejected = match_all(setup, pictures, scale, on_progress)
     times = _Times(timing or ScanTiming(1.0), model.image_height, model.image_width)
-    links = [_link(setup, match, number_of, scale, times) for match in matches]
     on_progress("adjusting", 0, None)
-    fit = adjust(setup, state, links)
-    left_out = sorted(set(range(len(links))) - set(fit.kept))
+    known = model.magnification_range if calibrated else None
+    used = check_connected(pictures, matches, rejected, known=known)
+    ladder = _Ladder(model, places, scale, times)
+    turns = compare_turns(pictures, matches)
+    fitted, notes = _adjust_as_they_lie(ladder, used, matches, turns, calibrated=calibrated)
+    left_out: list[int] = []
+    while (wrong := find_misstatement(fitted.setup, fitted.fit)) is not None:
+        own = [k for k in used if places[k].magnification == wrong.magnification]
+        notes.append(_leave_out(ladder, used, own, wrong))
+        left_out += own
+        used = check_connected(pictures, matches, rejected, known=known, left_out=left_out)
+        fitted = ladder.adjust(used, matches)
+    setup, fit, links = fitted.setup, fitted.fit, fitted.links
+    disagreement = measure_disagreement(setup, fit)
+    if calibrated and not disagreement.is_chance:
+        notes.append(
+            "in the calibrated range the pictures disagree with the calibration (chi-square "
+            f"{disagreement.chi_square:.0f} for {disagreement.freedom}), which may not hold any more: check it with a "
+            "grid (semcal check)"
+        )
     rejected += [
         RejectedPair(
             setup.pictures[links[k].first].name,
             setup.pictures[links[k].second].name,
             "it does not agree with the other pairs",
         )
-        for k in left_out
+        for k in sorted(set(range(len(links))) - set(fit.kept))
     ]
     check_fit(setup, fit, links)
-    names = tuple(pictures[k].name or f"picture {k}" for k in unused)
-    return LadderMeasurement(setup, fit, tuple(links), scale, tuple(rejected), names, tuple(used))
+    names = tuple(place.name for k, place in enumerate(places) if k not in used)
+    return LadderMeasurement(
+        setup, fit, links, scale, tuple(rejected), names, tuple(used), tuple(notes)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """An adjusted ladder: its unknowns, their values, and the correspondences."""
+
+    setup: LadderSetup
+    fit: LadderFit
+    links: tuple[Link, ...]
+
+    @property
+    def minus_log_evidence(self) -> float:
+        """See :func:`.minus_log_evidence`."""
+        return minus_log_evidence(self.setup, self.fit, self.links)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ladder:
+    """What the adjustments of one ladder have in common."""
+
+    model: CalibrationModel
+    places: tuple[PicturePlace, ...]
+    scale: float
+    times: _Times
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the calibration, px."""
+        return self.model.image_width, self.model.image_height
+
+    def adjust(self, used: Sequence[int], matches: Sequence[Match]) -> _Fitted:
+        """Adjust the pictures that are used, by the matches between them."""
+        number_of = {number: k for k, number in enumerate(used)}
+        setup = make_setup(self.model, tuple(self.places[k] for k in used), self.size)
+        own = [match for match in matches if {match.first, match.second} <= set(number_of)]
+        state = _start(setup, own, number_of, self.scale)
+        links = tuple(_link(setup, match, number_of, self.scale, self.times) for match in own)
+        return _Fitted(setup, adjust(setup, state, links), links)
+
+
+def _adjust_as_they_lie(
+    ladder: _Ladder,
+    used: Sequence[int],
+    matches: Sequence[Match],
+    turns: Turns,
+    *,
+    calibrated: bool,
+) -> tuple[_Fitted, list[str]]:
+    """Adjust, and tell what is to be said of how the pictures lie against the calibration.
+
+    Raises
+    ------
+    CalibrationError
+        If they are mirrored or turned against it, or the adjustment does not converge.
+    """
+    opposite = turns.opposite > turns.stated
+    notes: list[str] = []
+    if opposite:
+        notes.append(
+            "scans turn against what is stated of their rotation, and were taken as the pictures show it: the "
+            "microscope calls the other sense positive"
+        )
+    elif turns.otherwise:
+        notes.append(
+            f"{counted(turns.otherwise, 'pair')} of pictures whose scans are turned by another angle than is stated, "
+            "and were taken as the pictures show it"
+        )
+    if not calibrated:
+        return ladder.adjust(used, matches), notes
+    fitted: _Fitted | None = None
+    failure: CalibrationError | None = None
+    try:
+        fitted = ladder.adjust(used, matches)
+        check_fit(fitted.setup, fitted.fit, fitted.links)
+    except CalibrationError as error:
+        failure = error
+    if (
+        fitted is not None
+        and failure is None
+        and not opposite
+        and measure_disagreement(fitted.setup, fitted.fit).is_chance
+    ):
+        return fitted, notes
+    as_it_is = np.inf if fitted is None else fitted.minus_log_evidence
+    others = [(_adjust_flipped(ladder, used, matches, flip), flip) for flip in FLIPS]
+    least, likely = min(others, key=lambda one: one[0])
+    if least < as_it_is - SURE:
+        raise CalibrationError(
+            f"pictures that are {likely.name} against those of the calibration: its distortion fits them only so",
+            expected="pictures as the microscope showed them when it was calibrated",
+            do=f"flip them back, or calibrate with pictures that are {likely.name}, too",
+        ) from failure
+    if fitted is None:
+        assert failure is not None
+        raise failure
+    if opposite and min(cost for cost, flip in others if flip.is_mirror) < as_it_is + SURE:
+        notes[-1] += ", or all pictures are mirrored, which their distortion does not tell"
+    return fitted, notes
+
+
+def _adjust_flipped(
+    ladder: _Ladder, used: Sequence[int], matches: Sequence[Match], flip: Flip
+) -> float:
+    """Minus twice the log evidence of flipped pictures; infinite if they show no ladder."""
+    try:
+        fitted = ladder.adjust(used, [flip_match(match, flip) for match in matches])
+        check_fit(fitted.setup, fitted.fit, fitted.links)
+    except CalibrationError:
+        return np.inf
+    return fitted.minus_log_evidence
+
+
+def _leave_out(
+    ladder: _Ladder, used: Sequence[int], own: Sequence[int], wrong: Misstatement
+) -> str:
+    """Say why pictures of a magnification are left out.
+
+    Raises
+    ------
+    CalibrationError
+        If the ladder has a gap without them.
+    """
+    kept = [ladder.places[k].magnification for k in used if k not in own]
+    other = "larger" if wrong.deviation > 0.0 else "smaller"
+    names = ", ".join(ladder.places[k].name for k in own[:_MOST_NAMED])
+    names += f" and {len(own) - _MOST_NAMED} more" if len(own) > _MOST_NAMED else ""
+    seen = (
+        f"{counted(len(own), 'picture')} at {wrong.magnification:g}x ({names}) whose magnification the others show to "
+        f"be {100.0 * abs(wrong.deviation):.2g} % {other}"
+    )
+    try:
+        _check_range(ladder.model, kept)
+    except CalibrationError as error:
+        raise CalibrationError(
+            seen,
+            expected="the magnification or pixel size that they were taken at",
+            do="correct it, or record them again; the ladder needs them",
+        ) from error
+    return f"left out: {seen}; their magnification or pixel size is not what is stated"
 
 
 def describe_ladder(measured: LadderMeasurement) -> dict[str, object]:
@@ -337,9 +464,14 @@ def _check_model(model: CalibrationModel) -> None:
 
 
 def _check_ladder(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> None:
-    for picture in pictures:
-        check_positive(picture.magnification, "magnification")
-    seen = sorted({picture.magnification for picture in pictures})
+    _check_range(
+        model, [check_positive(picture.magnification, "magnification") for picture in pictures]
+    )
+
+
+def _check_range(model: CalibrationModel, magnifications: Sequence[float]) -> None:
+    """Refuse a ladder that does not begin in the calibrated range, or has a gap."""
+    seen = sorted(set(magnifications))
     low, high = model.magnification_range
     if not any(low * (1 - 1e-6) <= g <= high * (1 + 1e-6) for g in seen):
         listed = f"{seen[0]:g}x to {seen[-1]:g}x" if seen else "nothing"
@@ -348,22 +480,18 @@ def _check_ladder(model: CalibrationModel, pictures: Sequence[LadderPicture]) ->
             expected=f"one that begins between {low:g}x and {high:g}x",
             do="record pictures of the same place there, in steps of at most 1.6",
         )
-    for below, above in pairwise(seen):
-        if above > LARGEST_STEP * _ROUNDING * below and (above > high or below < low):
-            raise CalibrationError(
-                f"a gap in the ladder from {below:g}x to {above:g}x, a factor of {above / below:.2f}",
-                expected=f"steps of at most {LARGEST_STEP:g}",
-                do=f"record pictures at {np.sqrt(below * above):.0f}x, too",
-            )
+    check_steps(seen, (low, high))
 
 
-def _scale_of_pictures(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> float:
-    """Pixels of the calibration per pixel of the pictures."""
+def scale_of_pictures(model: CalibrationModel, pictures: Sequence[LadderPicture]) -> float:
+    """Pixels of the calibration per pixel of the pictures; raises :class:`InvalidValueError` for another shape."""
     shapes = {picture.image.shape for picture in pictures}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        sizes = " and ".join(" x ".join(map(str, shape[1::-1])) for shape in sorted(shapes))
         raise InvalidValueError(
-            f"pictures of the shapes {sorted(map(str, shapes))}",
+            f"pictures of {sizes} px" if sizes else "no pictures",
             expected="grey pictures of one size",
+            do="take all with the same scan, and cut all data bars off alike",
         )
     height, width = next(iter(shapes))
     ratio = model.image_width / width
@@ -403,154 +531,15 @@ class _Times:
         return np.asarray((offset - middle) / self.timing.frame_time_s)
 
 
-def _calibrated_xy(xy: Array, scale: float) -> Array:
-    return scale * (xy + 0.5) - 0.5
-
-
-def _picture_xy(xy: Array, scale: float) -> Array:
-    return (xy + 0.5) / scale - 0.5
-
-
-# -- correspondences ------------------------------------------------------------------------------
-
-
-def _candidates(pictures: Sequence[LadderPicture]) -> list[tuple[int, int]]:
-    """Pairs of one magnification, and of neighbouring ones, the lower magnification first."""
-    levels: dict[float, list[int]] = {}
-    for number, picture in enumerate(pictures):
-        levels.setdefault(picture.magnification, []).append(number)
-    ascending = sorted(levels)
-    pairs = [pair for g in ascending for pair in combinations(levels[g], 2)]
-    for below, above in pairwise(ascending):
-        if above <= LARGEST_STEP * _ROUNDING * below:
-            pairs += list(product(levels[below], levels[above]))
-    return pairs
-
-
-def _match_all(
-    setup: LadderSetup,
-    pictures: Sequence[LadderPicture],
-    scale: float,
-    on_progress: Callable[[str, int, int | None], object],
-) -> tuple[list[_Match], list[RejectedPair]]:
-    """Match all pairs that may overlap."""
-    start = start_state(setup)
-    cameras = [camera_of(start, k) for k in range(len(pictures))]
-    prepared = [Prepared(np.asarray(p.image, dtype=np.float32)) for p in pictures]
-    pairs = _candidates(pictures)
-    matches: list[_Match] = []
-    rejected: list[RejectedPair] = []
-    for done, (first, second) in enumerate(pairs):
-        on_progress("matching pictures", done, len(pairs))
-        best: tuple[float, Correspondences] | None = None
-        reason = ""
-        for turn in _turns_to_try(pictures[first], pictures[second]):
-            predict = _predictor(cameras[first], cameras[second], turn, scale)
-            found = match_pictures(prepared[first], prepared[second], predict)
-            if isinstance(found, Rejection):
-                reason = (
-                    found.reason if not reason or found.status is PairFailure.PERIODIC else reason
-                )
-                continue
-            if best is None or found.correlation * np.sqrt(len(found)) > best[0]:
-                best = (found.correlation * float(np.sqrt(len(found))), found)
-            if found.correlation > 0.5:
-                break
-        if best is None:
-            names = (setup.pictures[first].name, setup.pictures[second].name)
-            rejected.append(RejectedPair(*names, reason))
-            continue
-        matches.append(_Match(first, second, best[1]))
-    on_progress("matching pictures", len(pairs), len(pairs))
-    return matches, rejected
-
-
-def _turns_to_try(first: LadderPicture, second: LadderPicture) -> tuple[float, ...]:
-    if first.scan_rotation_rad is None or second.scan_rotation_rad is None:
-        return _QUARTERS
-    return (second.scan_rotation_rad - first.scan_rotation_rad,)
-
-
-def _predictor(
-    first: ScanCamera, second: ScanCamera, turn: float, scale: float
-) -> Callable[[Array], Array]:
-    """Where the second picture would show a pixel of the first if their middles showed the same."""
-    c, s = np.cos(turn), np.sin(turn)
-    rotation = np.array([[c, -s], [s, c]])
-
-    def middle(camera: ScanCamera) -> Array:
-        at = 0.5 * np.array([[camera.width - 1.0, camera.height - 1.0]])
-        return camera.sem_from_ideal(camera.undistort(at))[0, :2]
-
-    here, there = middle(first), middle(second)
-
-    def predict(xy: Array) -> Array:
-        ideal = first.undistort(_calibrated_xy(xy, scale))
-        flat = (first.sem_from_ideal(ideal)[:, :2] - here) @ rotation.T + there
-        seen = second.project(np.column_stack([flat, np.zeros(len(flat))]))
-        return _picture_xy(seen, scale)
-
-    return predict
-
-
-def _check_connected(
-    pictures: Sequence[LadderPicture],
-    matches: Sequence[_Match],
-    rejected: Sequence[RejectedPair],
-) -> tuple[list[int], list[int]]:
-    """Numbers of the pictures that hang together, and of the others.
-
-    Raises
-    ------
-    CalibrationError
-        If they do not reach from one end of the ladder to the other.
-    """
-    near: dict[int, set[int]] = {k: set() for k in range(len(pictures))}
-    for match in matches:
-        near[match.first].add(match.second)
-        near[match.second].add(match.first)
-    groups: list[set[int]] = []
-    left = set(near)
-    while left:
-        group, queue = set(), deque([min(left)])
-        while queue:
-            number = queue.popleft()
-            if number not in group:
-                group.add(number)
-                queue.extend(near[number] - group)
-        groups.append(group)
-        left -= group
-    largest = max(groups, key=len)
-    levels = sorted({picture.magnification for picture in pictures})
-    missing = [g for g in levels if not any(pictures[k].magnification == g for k in largest)]
-    if missing or len(largest) < 2:
-        reasons = [pair.reason for pair in rejected]
-        most = max(set(reasons), key=reasons.count) if reasons else "too few pictures"
-        present = [g for g in levels if g not in missing]
-        where = f"{missing[0]:g}x" if missing else f"{levels[0]:g}x"
-        nearest = (
-            min(present, key=lambda g: abs(np.log(g / missing[0]))) if missing and present else 0.0
-        )
-        rest = f" and those at {nearest:g}x" if nearest and len(largest) > 1 else ""
-        if any("repeats" in reason for reason in reasons):
-            most = "a specimen that repeats"
-        raise CalibrationError(
-            f"pictures at {where}{rest} that were not matched: {most}",
-            expected="pictures of one place with texture that does not repeat, which overlap by a fifth at least",
-            do="keep the place in the middle from step to step, and move by a fifth to a third of the field",
-        )
-    return sorted(largest), sorted(set(near) - largest)
-
-
 def _link(
     setup: LadderSetup,
-    match: _Match,
+    match: Match,
     number_of: Mapping[int, int],
     scale: float,
     times: _Times,
 ) -> Link:
     first_xy, second_xy = (
-        _calibrated_xy(xy, scale) for xy in (match.found.first_xy, match.found.second_xy)
+        calibrated_xy(xy, scale) for xy in (match.found.first_xy, match.found.second_xy)
     )
     return make_link(
         setup,
@@ -564,7 +553,7 @@ def _link(
 
 def _start(
     setup: LadderSetup,
-    matches: Sequence[_Match],
+    matches: Sequence[Match],
     number_of: Mapping[int, int],
     scale: float,
 ) -> LadderState:
@@ -575,7 +564,7 @@ def _start(
     for match in matches:
         a, b = number_of[match.first], number_of[match.second]
         flat_a, flat_b = (
-            cameras[k].sem_from_ideal(cameras[k].undistort(_calibrated_xy(xy, scale)))[:, :2]
+            cameras[k].sem_from_ideal(cameras[k].undistort(calibrated_xy(xy, scale)))[:, :2]
             for k, xy in ((a, match.found.first_xy), (b, match.found.second_xy))
         )
         near[a].append((b, flat_a, flat_b))
@@ -796,9 +785,16 @@ def describe_steps(measured: LadderMeasurement) -> tuple[LadderStep, ...]:
 
 
 def find_unrest(measured: LadderMeasurement) -> tuple[str, ...]:
-    """What shows that the specimen or the microscope was not quite at rest, in sentences."""
+    """What contradicts what is stated, and what shows that something was not quite at rest, in sentences."""
     setup, fit = measured.setup, measured.fit
-    found = []
+    found = list(measured.notes)
+    drift_px = _drift_px(fit) / measured.scale
+    if drift_px > SETTLED_DRIFT_PX:
+        last = max(picture.magnification for picture in setup.pictures)
+        found.append(
+            f"pictures agree only with a drift within a frame of {drift_px:.1f} px (1-sigma) at {last:g}x: the "
+            "specimen has not settled, or something that is fixed to the scan, and no drift, distorts them"
+        )
     if fit.variance_factor > _NOTED_FACTOR:
         found.append(
             f"pictures disagree by {np.sqrt(fit.variance_factor):.1f} times what their noise explains, which the "
@@ -839,7 +835,7 @@ def _find_weaknesses(
         )
     if extended.ladder is not None and extended.ladder.relays:
         found += [
-            f"the scale jumps by {100.0 * relay.jump:+.2f} % between {relay.low:g}x and {relay.high:g}x: "
+            f"the scale (px per m) jumps by {100.0 * relay.jump:+.2f} % between {relay.low:g}x and {relay.high:g}x: "
             "record more magnifications there to find where"
             for relay in extended.ladder.relays
         ]

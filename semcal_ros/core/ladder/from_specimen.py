@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -36,16 +35,19 @@ from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.extend import (
-    LARGEST_STEP,
     LadderMeasurement,
-    LadderPicture,
     LadderStep,
-    RejectedPair,
     describe_ladder,
     describe_steps,
     find_unrest,
     make_model,
     measure_ladder,
+)
+from semcal_ros.core.ladder.matching import (
+    LARGEST_STEP,
+    LadderPicture,
+    RejectedPair,
+    check_steps,
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup
 
@@ -62,7 +64,6 @@ __all__ = [
 METHOD = "specimen"
 # The lowest two magnifications are where the functions begin: constants and slopes there, bends beyond.
 _LEAST_MAGNIFICATIONS = 3
-_ROUNDING = 1.02
 # Prior 1-sigma of the constants: those of an instrument that nobody knows; relative, in normalised coordinates, or, of
 # centres, in image widths.
 _CONSTANTS = {"aspect": 0.01, "skew": 0.01, "xi_r": 0.03, "xi_t": 0.01, "ex": 0.08, "ey": 0.08}
@@ -332,13 +333,7 @@ def calibrate_from_specimen(
             expected=f"{_LEAST_MAGNIFICATIONS} or more, in steps of at most {LARGEST_STEP:g}",
             do="record more, or take a grid",
         )
-    for below, above in pairwise(seen):
-        if above > LARGEST_STEP * _ROUNDING * below:
-            raise CalibrationError(
-                f"a gap from {below:g}x to {above:g}x, a factor of {above / below:.2f}",
-                expected=f"steps of at most {LARGEST_STEP:g}",
-                do=f"record pictures at {np.sqrt(below * above):.0f}x, too",
-            )
+    check_steps(seen)
     if isinstance(known, ScaleAnchor):
         anchor = known
     elif isinstance(known, StageMoves):
@@ -366,7 +361,9 @@ def calibrate_from_specimen(
             expected="one at a magnification of that range",
         )
     start = _unknown_microscope(pictures[0].image.shape, seen, anchor, display_width_m)
-    measured = measure_ladder(start, pictures, timing=timing, on_progress=on_progress)
+    measured = measure_ladder(
+        start, pictures, timing=timing, on_progress=on_progress, calibrated=False
+    )
     model = make_model(measured)
     if isinstance(known, KnownLength):
         anchor = known.as_anchor(model, anchor.magnification)
@@ -477,7 +474,7 @@ def _find_weaknesses(
         found.append(f"one picture only at {listed}: nothing tells the distortion there")
     if model.ladder is not None:
         found += [
-            f"the scale jumps by {100.0 * relay.jump:+.2f} % between {relay.low:g}x and {relay.high:g}x"
+            f"the scale (px per m) jumps by {100.0 * relay.jump:+.2f} % between {relay.low:g}x and {relay.high:g}x"
             for relay in model.ladder.relays
         ]
     return tuple(found)

@@ -309,10 +309,12 @@ def extend_functions(
         old = own.extension
         if name not in _UNSEEN:
             if len(old) and (old[-1] > old[0]) != (knots[-1] > knots[0]):
-                side = "upwards" if knots[-1] > knots[0] else "downwards"
+                way, before = "upwards", "downwards"
+                if knots[-1] < knots[0]:
+                    way, before = before, way
                 raise InvalidValueError(
-                    f"a ladder {side} for a calibration that was extended to the other side",
-                    expected="one that was extended to this side, or not at all",
+                    f"a ladder {way} for a calibration that was extended {before} already",
+                    expected=f"a calibration of a grid alone, or one that was extended {way}",
                     do="extend the calibration of the grid to this side, into a file of its own",
                 )
             added = knots[1:] if len(old) else knots
@@ -342,7 +344,9 @@ def make_setup(
         raise InvalidValueError(
             f"a ladder from {seen[0]:g}x to {seen[-1]:g}x for a calibration of {low:g}x to {high:g}x",
             expected="one that goes beyond one end of it",
-            do="leave out the pictures beyond its other end",
+            do="make two files: one by the pictures in the range and above, one by those in the range and below"
+            if above
+            else "record pictures beyond it; inside, views of a grid improve a calibration (semcal update)",
         )
     outwards = above or below[::-1]
     knots = np.array([high if above else low, *outwards])

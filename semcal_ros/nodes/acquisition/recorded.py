@@ -33,7 +33,7 @@ from semcal_ros.files.recordings import RecordedFrame, open_recording
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import count_visits
 
-__all__ = ["Judge", "RecordedView", "read_views"]
+__all__ = ["Judge", "RecordedView", "read_pictures", "read_views"]
 
 #: Says whether a picture is one of the views: its magnification, grey levels, corners, and the stage.
 Judge = Callable[[float, NDArray[Any], LatticeDetection, StageReading | None], bool]
@@ -77,27 +77,57 @@ def read_views(
     InvalidValueError
         Its pictures have another size.
     """
+    taken: list[tuple[FoundView, RecordedFrame]] = []
+
+    def adopt(frame: RecordedFrame) -> bool:
+        grey = to_gray(frame.visible, frame.encoding)
+        found = find_lattice(grey)
+        g, stage = frame.magnification, frame.stage
+        if isinstance(found, Rejection) or not judge(g, grey, found, stage):
+            return False
+        view = FoundView(f"view {len(taken)}", g, None, found, stage)
+        taken.append((view, replace(frame, image=frame.image[:0])))
+        return True
+
+    visits = read_pictures(path, config, size, adopt, on_frame)
+    return [
+        RecordedView(replace(view, visit=visit), frame.stamp_ns, frame.conditions or Conditions())
+        for (view, frame), visit in zip(taken, visits, strict=True)
+    ]
+
+
+def read_pictures(
+    path: Path,
+    config: MicroscopeConfig,
+    size: tuple[int, int] | None,
+    adopt: Callable[[RecordedFrame], bool],
+    on_frame: Callable[[RecordedFrame], object],
+) -> list[int]:
+    """Read the pictures of a recording; return the visits, from 0 on, of those that were taken.
+
+    Parameters
+    ----------
+    path, config, size, on_frame
+        As of :func:`read_views`; its errors.
+    adopt
+        Asked of each picture whether it is taken.
+    """
     magnifications: list[float] = []
     stamps_ns: list[int | None] = []
-    taken: list[tuple[int, RecordedView]] = []
+    taken: list[int] = []
     with open_recording(path, config) as recording:
         for number, frame in enumerate(recording.frames()):
             on_frame(frame)
-            grey = to_gray(frame.visible, frame.encoding)
-            recorded = grey.shape[1], grey.shape[0]
-            if size is not None and recorded != size:
+            height, width = frame.visible.shape[:2]
+            if size is not None and (width, height) != size:
                 raise InvalidValueError(
-                    "{} x {} px pictures in {}".format(*recorded, path),
+                    f"{width} x {height} px pictures in {path}",
                     expected="{} x {} px, as live".format(*size),
                     do="set the scan as it was, or begin anew without resume",
                 )
             magnifications.append(frame.magnification)
             stamps_ns.append(frame.stamp_ns)
-            found = find_lattice(grey)
-            g, stage = frame.magnification, frame.stage
-            if not isinstance(found, Rejection) and judge(g, grey, found, stage):
-                view = FoundView(f"view {len(taken)}", g, None, found, stage)
-                known = frame.conditions or Conditions()
-                taken.append((number, RecordedView(view, frame.stamp_ns, known)))
+            if adopt(frame):
+                taken.append(number)
     visits = count_visits(magnifications, stamps_ns)
-    return [replace(one, view=replace(one.view, visit=visits[k])) for k, one in taken]
+    return [visits[number] for number in taken]

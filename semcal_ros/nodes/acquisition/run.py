@@ -12,14 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A calibration that records itself: goes to each view, takes it, calibrates, and chooses the next ones."""
+"""A calibration that records itself: goes to each picture, takes it, calibrates, and chooses the next ones."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
@@ -27,7 +28,6 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.acquisition import (
     MOST_VIEWS,
     AcquisitionGoal,
-    Proposal,
     ViewRequest,
     find_picture_fault,
     is_magnification_of,
@@ -38,12 +38,23 @@ from semcal_ros.core.calibration.acquisition import (
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError
+from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.wording import counted
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 from semcal_ros.nodes.acquisition.follow import GridFollower, Lookout, Posture
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 
-__all__ = ["ACQUISITION", "AcquisitionRun", "Progress", "ViewTaker", "describe_request", "goal_of"]
+__all__ = [
+    "ACQUISITION",
+    "AWAY",
+    "AcquisitionRun",
+    "Progress",
+    "Run",
+    "Taker",
+    "ViewTaker",
+    "describe_request",
+    "goal_of",
+]
 
 ACQUISITION = (
     ParameterDeclaration(
@@ -66,6 +77,9 @@ ACQUISITION = (
         "",
         1e-5,
         0.1,
+    ),
+    ParameterDeclaration(
+        "extend_to", 0.0, "Magnification that ~/extend reaches; 0: not known.", "", 0.0, 1e8
     ),
     ParameterDeclaration("tilts_deg", "0, 20, 40", "Tilts of the views of each visit, degrees."),
     ParameterDeclaration(
@@ -94,12 +108,10 @@ ACQUISITION = (
 
 # Pictures of one view before it is left out: noise or a vibration passes, a grid that is not there does not.
 _ATTEMPTS = 3
-# Views left out in a row before somebody must look.
-_MOST_LEFT_OUT = 3
 # The picture that is being scanned on arrival, and the first that is scanned after it.
 _PICTURES = 2
-# Ratio to a magnification that is only set to come back from, as a visit must.
-_AWAY = 1.25
+#: Ratio to a magnification that is only set to come back from, as a visit must.
+AWAY = 1.25
 
 
 def goal_of(
@@ -168,27 +180,217 @@ class Progress:
     largest: float = math.nan
 
 
-class ViewTaker(Lookout, Protocol):
-    """What looks at the pictures and calibrates; all calls may last, and end by ``still_wanted`` of the run."""
+class Taker(Protocol):
+    """What looks at the pictures; all calls may last, and end by ``still_wanted`` of the run."""
 
-    def take(self, request: ViewRequest) -> str:
-        """Make a view of the newest picture, and say which; raises :class:`CalibrationError` with what is wrong."""
+    def wait_for_pictures(self, count: int) -> None:
+        """Return after so many more pictures; raises :class:`MicroscopeError` if they stay away."""
 
-    def wait_for_view(self, request: ViewRequest) -> str:
+    def take(self, request: Any) -> str:
+        """Make use of the newest picture, and say which; raises :class:`CalibrationError` with what is wrong."""
+
+    def wait_for_view(self, request: Any) -> str:
         """Return what a person has taken for a request."""
 
     def stage(self) -> StageReading | None:
         """Return where the stage is now."""
 
-    def calibrate(self) -> Calibration:
-        """Calibrate from all views; raises :class:`CalibrationError`."""
-
     def show(self, progress: Progress) -> None:
         """Tell how far the run is."""
 
 
-class AcquisitionRun:
-    """One acquisition, which can be stopped and gone on with.
+class ViewTaker(Lookout, Taker, Protocol):
+    """What makes views, and calibrates from them."""
+
+    def calibrate(self) -> Calibration:
+        """Calibrate from all views; raises :class:`CalibrationError`."""
+
+
+Request = TypeVar("Request", ViewRequest, PictureRequest)
+
+
+class Run(ABC, Generic[Request]):
+    """Requests that are answered by pictures, one after the other; it can be stopped and gone on with.
+
+    Parameters
+    ----------
+    requests
+        What is to be taken first.
+    taker
+        Looks at the pictures.
+    commands
+        Moves; None where a person does.
+    still_wanted
+        If it returns False, the run ends as soon as nothing moves.
+
+    Attributes
+    ----------
+    service
+        What is called to go on with it.
+    unit
+        What a picture that was taken is called.
+    progress
+        How far it is.
+    discarded
+        Whether it cannot be gone on with.
+    """
+
+    service, unit = "", ""
+    #: Requests left out in a row before somebody must look.
+    most_left_out = 3
+
+    def __init__(
+        self,
+        requests: Iterable[Request],
+        taker: Taker,
+        commands: MicroscopeCommands | None,
+        still_wanted: Callable[[], bool],
+    ) -> None:
+        self.discarded = False
+        self._taker = taker
+        self._commands = commands
+        self._still_wanted = still_wanted
+        self._waiting: list[Request] = list(requests)
+        self._requested: list[Request] = []
+        self._left_out = 0
+        self._in_a_row = 0
+        self._visit = -1
+        self._magnification = math.nan
+        self.progress = Progress("stopped", "not begun", planned=len(self._waiting))
+
+    @property
+    @abstractmethod
+    def reached(self) -> bool:
+        """Whether what was asked for is met."""
+
+    def run(self) -> str:
+        """Go on until the end, and say in words why and with what it ended.
+
+        Raises
+        ------
+        SemcalError
+            The microscope refuses or is silent, what is looked at is lost, a calibration fails, or it is not wanted
+            any more. Another call goes on where this one ended.
+        """
+        # Somebody may have moved it meanwhile.
+        self._visit = -1
+        self._in_a_row = 0
+        while True:
+            while self._waiting:
+                self._take(self._waiting[0])
+                self._requested.append(self._waiting.pop(0))
+            if ended := self._conclude():
+                return ended
+
+    @abstractmethod
+    def _conclude(self) -> str:
+        """Calibrate from what was taken; return why it ends, or nothing after asking for more."""
+
+    @abstractmethod
+    def _describe(self, request: Request) -> str:
+        """Return what has to be done for a request."""
+
+    @abstractmethod
+    def _go(self, request: Request, commands: MicroscopeCommands) -> None:
+        """Bring the microscope to where a request wants it."""
+
+    def _remember(self, request: Request) -> None:
+        """Note that a request was answered from where the microscope is."""
+
+    def _is_needed(self, request: Request) -> bool:
+        """Return whether it cannot go on without an answer to a request."""
+        return False
+
+    def _recover(self, request: Request) -> None:
+        """Do what helps after a picture that was not usable; raises :class:`CalibrationError`."""
+
+    def report(self, text: str) -> None:
+        """Tell how far it is, with what has just been done."""
+        self._show("running", text)
+
+    def _show(self, state: str, text: str) -> None:
+        taken = len(self._requested) - self._left_out
+        planned = len(self._requested) + len(self._waiting)
+        self.progress = replace(
+            self.progress,
+            state=state,
+            text=text,
+            views=taken,
+            planned=planned,
+            left_out=self._left_out,
+        )
+        self._taker.show(self.progress)
+
+    def _refuse_unwanted(self) -> None:
+        if not self._still_wanted():
+            raise CalibrationError("stopped", do=f"call {self.service} to go on")
+
+    def _take(self, request: Request) -> None:
+        described = self._describe(request)
+        if self._commands is None:
+            self._show("waiting", described)
+            self._show("running", self._taker.wait_for_view(request))
+            return
+        fault = ""
+        for attempt in range(_ATTEMPTS):
+            self._refuse_unwanted()
+            again = f" (again: {fault})" if fault else ""
+            self._show("running", f"{described}{again}")
+            self._go(request, self._commands)
+            self._taker.wait_for_pictures(_PICTURES + attempt)
+            try:
+                self._show("running", self._taker.take(request))
+            except CalibrationError as error:
+                fault = str(error)
+            else:
+                self._in_a_row = 0
+                self._remember(request)
+                return
+            if attempt + 1 < _ATTEMPTS:
+                try:
+                    self._recover(request)
+                except CalibrationError as error:
+                    fault = str(error)
+        if self._is_needed(request):
+            raise CalibrationError(
+                f"no usable picture: {fault}",
+                do=f"look at the microscope, then call {self.service} to go on",
+            )
+        self._left_out += 1
+        self._in_a_row += 1
+        if self._in_a_row >= self.most_left_out:
+            raise CalibrationError(
+                f"{counted(self._in_a_row, self.unit)} in a row without a usable picture, the last: {fault}",
+                do=f"look at the microscope, then call {self.service} to go on",
+            )
+        self._show("running", f"left out: {fault}")
+
+    def _set_anew(self, visit: int, g: float, away: float, commands: MicroscopeCommands) -> None:
+        """Set the magnification of a visit, from another one; once for all of its requests."""
+        if visit == self._visit:
+            return
+        if g == self._magnification:
+            commands.set_magnification(away)
+            self._taker.wait_for_pictures(1)
+        commands.set_magnification(g)
+        self._visit, self._magnification = visit, g
+
+    def _move(
+        self,
+        target: Mapping[str, float],
+        current: Mapping[str, float | None],
+        commands: MicroscopeCommands,
+    ) -> None:
+        try:
+            commands.move(target, current)
+        except MicroscopeError:
+            # Where it stands is not known.
+            self._visit = -1
+            raise
+
+
+class AcquisitionRun(Run[ViewRequest]):
+    """One acquisition of views of a grid.
 
     Parameters
     ----------
@@ -196,22 +398,18 @@ class AcquisitionRun:
         What is asked for.
     taker
         Looks and calibrates.
-    commands
-        Moves; None where a person does.
+    commands, still_wanted
+        As of :class:`Run`.
     turn_by
         Which joint turns the grid in the image.
-    still_wanted
-        If it returns False, the run ends as soon as nothing moves.
 
     Attributes
     ----------
     goal
         What is asked for.
-    progress
-        How far it is.
-    discarded
-        Whether it cannot be gone on with.
     """
+
+    service, unit = "~/acquire", "view"
 
     def __init__(
         self,
@@ -221,22 +419,19 @@ class AcquisitionRun:
         turn_by: str,
         still_wanted: Callable[[], bool],
     ) -> None:
+        super().__init__(plan_survey(goal), taker, commands, still_wanted)
         self.goal = goal
-        self.discarded = False
-        self._taker = taker
-        self._commands = commands
+        self._calibrate = taker.calibrate
         self._turn_by = turn_by
-        self._still_wanted = still_wanted
-        self._waiting = list(plan_survey(goal))
-        self._requested: list[ViewRequest] = []
-        self._left_out = 0
-        self._in_a_row = 0
+        self._posture: Posture = {}
         self._follower = None
         if commands is not None:
             self._follower = GridFollower(taker, commands, lambda text: self._show("running", text))
-        self._visit = -1
-        self._magnification = math.nan
-        self.progress = Progress("stopped", "not begun", planned=len(self._waiting))
+
+    @property
+    def reached(self) -> bool:
+        """Whether nm per pixel is as certain as was asked for."""
+        return self.progress.largest <= self.goal.target
 
     def adopt(
         self,
@@ -262,97 +457,35 @@ class AcquisitionRun:
         self._requested.append(own)
         return True
 
-    def run(self) -> Proposal:
-        """Go on until the target is met or cannot be; return the last proposal, which says why it ended.
-
-        Raises
-        ------
-        SemcalError
-            The microscope refuses or is silent, the grid is lost, a calibration fails, or it is not wanted any more.
-            Another call goes on where this one ended.
-        """
-        # Somebody may have moved it meanwhile.
-        self._visit = -1
-        self._in_a_row = 0
-        while True:
-            while self._waiting:
-                self._take(self._waiting[0])
-                self._requested.append(self._waiting.pop(0))
-            self._show("running", "calibrating")
-            model = self._taker.calibrate()
-            proposal = propose_visits(self.goal, model, self._requested)
-            self.progress = replace(self.progress, largest=proposal.largest)
-            if proposal.reason:
-                return proposal
-            self._waiting.extend(proposal.requests)
-
-    def report(self, text: str) -> None:
-        """Tell how far it is, with what has just been done."""
-        self._show("running", text)
-
-    def _show(self, state: str, text: str) -> None:
-        taken = len(self._requested) - self._left_out
-        planned = len(self._requested) + len(self._waiting)
-        self.progress = replace(
-            self.progress,
-            state=state,
-            text=text,
-            views=taken,
-            planned=planned,
-            left_out=self._left_out,
+    def _conclude(self) -> str:
+        self._show("running", "calibrating")
+        model = self._calibrate()
+        proposal = propose_visits(self.goal, model, self._requested)
+        self.progress = replace(self.progress, largest=proposal.largest)
+        self._waiting.extend(proposal.requests)
+        if not proposal.reason:
+            return ""
+        return (
+            f"{proposal.reason}: nm per px known to {100.0 * proposal.largest:.3f} % at {proposal.at:.0f}x, the "
+            "worst, repeatability aside; ~/save writes the calibration"
         )
-        self._taker.show(self.progress)
 
-    def _refuse_unwanted(self) -> None:
-        if not self._still_wanted():
-            raise CalibrationError("stopped", do="call ~/acquire to go on")
+    def _describe(self, request: ViewRequest) -> str:
+        return describe_request(request, self._turn_by)
 
-    def _take(self, request: ViewRequest) -> None:
-        described = describe_request(request, self._turn_by)
-        if self._commands is None:
-            self._show("waiting", described)
-            self._show("running", self._taker.wait_for_view(request))
-            return
-        fault = ""
-        for attempt in range(_ATTEMPTS):
-            self._refuse_unwanted()
-            again = f" (again: {fault})" if fault else ""
-            self._show("running", f"{described}{again}")
-            posture = self._go(request, self._commands)
-            self._taker.wait_for_pictures(_PICTURES + attempt)
-            try:
-                self._show("running", self._taker.take(request))
-            except CalibrationError as error:
-                fault = str(error)
-            else:
-                self._in_a_row = 0
-                if self._follower is not None:
-                    self._follower.remember(posture)
-                return
-            if attempt + 1 < _ATTEMPTS and self._follower is not None:
-                try:
-                    self._follower.bring_back(request, posture)
-                except CalibrationError as error:
-                    fault = str(error)
-        self._left_out += 1
-        self._in_a_row += 1
-        if self._in_a_row >= _MOST_LEFT_OUT:
-            raise CalibrationError(
-                f"{counted(self._in_a_row, 'view')} in a row without a usable picture, the last: {fault}",
-                do="look at the microscope, then call ~/acquire to go on",
-            )
-        self._show("running", f"left out: {fault}")
+    def _remember(self, request: ViewRequest) -> None:
+        if self._follower is not None:
+            self._follower.remember(self._posture)
 
-    def _go(self, request: ViewRequest, commands: MicroscopeCommands) -> Posture:
+    def _recover(self, request: ViewRequest) -> None:
+        if self._follower is not None:
+            self._follower.bring_back(request, self._posture)
+
+    def _go(self, request: ViewRequest, commands: MicroscopeCommands) -> None:
         g = request.magnification
-        if request.visit != self._visit:
-            if g == self._magnification:
-                up = g * _AWAY
-                inside = up <= self.goal.magnification_range[1]
-                commands.set_magnification(up if inside else g / _AWAY)
-                self._taker.wait_for_pictures(1)
-            commands.set_magnification(g)
-            self._visit, self._magnification = request.visit, g
+        up = g * AWAY
+        inside = up <= self.goal.magnification_range[1]
+        self._set_anew(request.visit, g, up if inside else g / AWAY, commands)
         now = self._taker.stage() or StageReading()
         target = {"tilt": request.tilt_rad}
         current: dict[str, float | None] = {"tilt": now.tilt_rad}
@@ -362,10 +495,5 @@ class AcquisitionRun:
         elif self._turn_by == "rotation":
             target["rotation"] = request.turn_rad
             current["rotation"] = now.rotation_rad
-        try:
-            commands.move(target, current)
-        except MicroscopeError:
-            # Where it stands is not known.
-            self._visit = -1
-            raise
-        return target
+        self._move(target, current, commands)
+        self._posture = target

@@ -85,7 +85,7 @@ EXECUTABLES = {
         "Collects views of the grid from the live stream, and calibrates from them.",
         "image_raw, magnification, stage, conditions",
         "calibration, ~/progress, ~/overlay",
-        "~/add_view, ~/calibrate, ~/calibrate_start, ~/acquire, ~/cancel, ~/check, ~/update, ~/save, ~/clear",
+        "~/add_view, ~/calibrate, ~/calibrate_start, ~/acquire, ~/extend, ~/cancel, ~/check, ~/update, ~/save, ~/clear",
         "-p config:=jsm820 -p output:=live.yaml",
     ),
     "virtual_sem": ExecutableHelp(

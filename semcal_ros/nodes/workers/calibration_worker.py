@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A calibration in a separate process, so that the stream continues and a shutdown need not wait for it.
+"""A calibration, or an extension of one, in a process of its own: the stream goes on, and a shutdown need not wait.
 
 The process does not import ROS.
 """
@@ -27,19 +27,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.plan import judge_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.core.errors import CalibrationError, SemcalError
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
+from semcal_ros.workflows.extend import extend_by_pictures
 
 __all__ = [
     "CalibrationJob",
     "CalibrationProcess",
+    "ExtensionJob",
     "JobResult",
     "Stage",
     "serve",
@@ -53,6 +58,11 @@ _OFTEN_S, _SELDOM_S = 0.2, 1.0
 # A third of the weight of a live node (sched(7)) where both want the same processor: live nodes keep up, and the
 # calibration still advances.
 _NICE = 5
+# Part of the work of an extension after which all pictures are matched.
+_MATCHED = 0.8
+
+#: Called with the name of a stage, and the fraction of the work that is done.
+OnStage = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,86 @@ class CalibrationJob:
     notes: tuple[str, ...] = ()
     provenance: Provenance | None = None
     conditions: Mapping[str, Conditions | None] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return f"{self.options.method} calibration from {self.source}"
+
+    @property
+    def source(self) -> str:
+        """What it is made from, in words."""
+        return counted(len(self.views), "view")
+
+    @property
+    def do_with_less(self) -> str:
+        """What to do where memory runs out."""
+        return "use fewer views, or residual off"
+
+    def compute(self, on_stage: OnStage) -> tuple[Calibration, str, tuple[str, ...]]:
+        """Calibrate; return the calibration, a summary, and notes. Raises :class:`SemcalError`."""
+        done = calibrate_found(
+            self.views,
+            (),
+            display_width_m=self.display_width_m,
+            squares_m=self.squares_m,
+            options=self.options,
+            grid_certificate=self.grid_certificate,
+            provenance=self.provenance,
+            conditions=self.conditions,
+            on_stage=on_stage,
+        )
+        held_out = [v for v in done.result.held_out_rms_px.values() if np.isfinite(v)]
+        worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
+        low, high = done.calibration.magnification_range
+        used = counted(len(done.collected.views), "view")
+        summary = f"{self.options.method} calibration from {used}, {low:g}x to {high:g}x{worst}"
+        return done.calibration, summary, (*self.notes, *done.result.warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensionJob:
+    """A calibration, and the pictures of a ladder by which it is extended. Notes go into the summary, provenance into
+    the file.
+    """
+
+    calibration: Calibration
+    pictures: tuple[LadderPicture, ...]
+    config: MicroscopeConfig
+    provenance: Provenance
+    notes: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return f"extension by {self.source}"
+
+    @property
+    def source(self) -> str:
+        """What it is made from, in words."""
+        return counted(len(self.pictures), "picture")
+
+    @property
+    def do_with_less(self) -> str:
+        """What to do where memory runs out."""
+        return "take smaller pictures"
+
+    def compute(self, on_stage: OnStage) -> tuple[Calibration, str, tuple[str, ...]]:
+        """Extend; return the calibration, a summary, and notes. Raises :class:`SemcalError`."""
+        done = extend_by_pictures(
+            self.calibration,
+            self.pictures,
+            self.config,
+            self.provenance,
+            notes=self.notes,
+            on_progress=lambda name, count, total: on_stage(
+                name, _MATCHED * count / total if total else _MATCHED
+            ),
+        )
+        low, high = done.calibration.magnification_range
+        used = counted(sum(step.pictures for step in done.result.steps), "picture")
+        summary = f"extended to {low:g}x to {high:g}x by {used}"
+        return done.calibration, summary, (*self.notes, *done.result.weaknesses)
 
 
 @dataclass(frozen=True)
@@ -92,41 +182,25 @@ def _refuse(error: SemcalError) -> JobResult:
     return JobResult("", str(error), failed=True)
 
 
-def _calibrate(job: CalibrationJob, on_stage: Callable[[str, float], None]) -> JobResult:
+def _compute(job: CalibrationJob | ExtensionJob, on_stage: OnStage) -> JobResult:
     started_s = time.monotonic()
     try:
-        done = calibrate_found(
-            job.views,
-            (),
-            display_width_m=job.display_width_m,
-            squares_m=job.squares_m,
-            options=job.options,
-            grid_certificate=job.grid_certificate,
-            provenance=job.provenance,
-            conditions=job.conditions,
-            on_stage=on_stage,
-        )
+        calibration, summary, notes = job.compute(on_stage)
     except SemcalError as error:
         return _refuse(error)
     except MemoryError:
-        what = f"not enough memory for a calibration from {counted(len(job.views), 'view')}"
-        return _refuse(CalibrationError(what, do="use fewer views, or residual off"))
-    held_out = [v for v in done.result.held_out_rms_px.values() if np.isfinite(v)]
-    worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
-    low, high = done.calibration.magnification_range
-    summary = (
-        f"{job.options.method} calibration from {counted(len(done.collected.views), 'view')}, "
-        f"{low:g}x to {high:g}x{worst}, in {time.monotonic() - started_s:.1f} s"
-    )
-    summary += f"; {judge_calibration(done.calibration).describe()}"
-    notes = "".join(f"; {warning}" for warning in (*job.notes, *done.result.warnings))
-    return JobResult(done.calibration.dumps(), summary + notes)
+        return _refuse(
+            CalibrationError(f"not enough memory for the {job.title}", do=job.do_with_less)
+        )
+    summary += f", in {time.monotonic() - started_s:.1f} s"
+    summary += f"; {judge_calibration(calibration).describe()}"
+    return JobResult(calibration.dumps(), summary + "".join(f"; {note}" for note in notes))
 
 
 def serve(channel: Channel) -> None:
     """Receive one job; answer with its stages and finally with its result."""
-    job: CalibrationJob = channel.receive()
-    channel.send(_calibrate(job, lambda name, fraction: channel.send(Stage(name, fraction))))
+    job: CalibrationJob | ExtensionJob = channel.receive()
+    channel.send(_compute(job, lambda name, fraction: channel.send(Stage(name, fraction))))
 
 
 def without_images(views: Sequence[FoundView]) -> tuple[FoundView, ...]:
@@ -138,7 +212,7 @@ def without_images(views: Sequence[FoundView]) -> tuple[FoundView, ...]:
 class CalibrationProcess:
     """One calibration; :meth:`run` waits for it and :meth:`cancel` ends it from another thread."""
 
-    def __init__(self, job: CalibrationJob) -> None:
+    def __init__(self, job: CalibrationJob | ExtensionJob) -> None:
         self.job = job
         self._lock = threading.Lock()
         self._process: ChildProcess | None = None
@@ -177,7 +251,7 @@ class CalibrationProcess:
             process.send(self.job)
             return self._result(process, still_wanted, _Progress(on_progress))
         except ChildProcessEnded as error:
-            text = "cancelled" if self._cancelled else _describe(error)
+            text = "cancelled" if self._cancelled else _describe(error, self.job.do_with_less)
             return JobResult("", text, failed=True)
         finally:
             with self._lock:
@@ -219,11 +293,11 @@ class _Progress:
             self._on_progress(self._stage)
 
 
-def _describe(error: ChildProcessEnded) -> str:
+def _describe(error: ChildProcessEnded, do_with_less: str) -> str:
     """Say why there is no result, and what to do."""
     do = "call again"
     if error.status == -signal.SIGKILL:
-        do = "call again; if nobody ended it, memory ran out: use fewer views, or residual off"
+        do = f"call again; if nobody ended it, memory ran out: {do_with_less}"
     elif error.status is None or error.status >= 0:
         do = "see the log of the node, and call again"
     return str(CalibrationError(f"the calibration process {error} without a result", do=do))

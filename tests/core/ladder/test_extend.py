@@ -28,12 +28,8 @@ from semcal_ros.core.camera.calibration_model import ScaleSigma
 from semcal_ros.core.camera.uncertainty_budget import budget_of_pixel_size
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.adjustment import adjust
-from semcal_ros.core.ladder.extend import (
-    LadderPicture,
-    LadderResult,
-    check_fit,
-    extend_calibration,
-)
+from semcal_ros.core.ladder.extend import LadderResult, check_fit, extend_calibration
+from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.ladder.residuals import Link, make_link
 from semcal_ros.core.ladder.unknowns import LadderState, PicturePlace, make_setup, start_state
 from tests.helpers.ladders import (

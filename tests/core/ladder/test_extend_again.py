@@ -21,7 +21,8 @@ import pytest
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.ladder.extend import LadderPicture, LadderResult, extend_calibration
+from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
+from semcal_ros.core.ladder.matching import LadderPicture
 from tests.helpers.ladders import (
     SIZE,
     aligned_rms_px,
@@ -81,8 +82,12 @@ def test_upwards_and_upwards_again(once: LadderResult, twice: LadderResult) -> N
 
 def test_the_other_side_is_refused_before_anything_is_measured(once: LadderResult) -> None:
     blank = [LadderPicture(np.zeros((SIZE, SIZE)), g) for g in (1400.0, 900.0)]
-    with pytest.raises(InvalidValueError, match=r"ladder downwards .* extended to the other side"):
+    with pytest.raises(InvalidValueError, match=r"ladder downwards .* extended upwards already"):
         extend_calibration(once.model, blank)
     both = [*blank, *(LadderPicture(np.zeros((SIZE, SIZE)), g) for g in (7000.0, 10000.0))]
-    with pytest.raises(InvalidValueError, match="beyond one end of it"):
-        extend_calibration(calibration_of(make_scope(1, RELAY)), both)
+    grid = calibration_of(make_scope(1, RELAY))
+    with pytest.raises(InvalidValueError, match="beyond one end of it; make two files"):
+        extend_calibration(grid, both)
+    inside = [LadderPicture(np.zeros((SIZE, SIZE)), g) for g in (3000.0, 4500.0)]
+    with pytest.raises(InvalidValueError, match="beyond one end of it; record pictures beyond it"):
+        extend_calibration(grid, inside)

@@ -23,13 +23,13 @@ import pytest
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.core.ladder.extend import LadderPicture
 from semcal_ros.core.ladder.from_specimen import (
     KnownLength,
     ScaleAnchor,
     SpecimenCalibration,
     calibrate_from_specimen,
 )
+from semcal_ros.core.ladder.matching import LadderPicture
 from tests.helpers.ladders import SIZE, aligned_rms_px, camera_at, ladder_of, make_scope
 
 STEPS = (5000.0, 7400.0, 11000.0, 16000.0)
@@ -93,7 +93,7 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
     known = ScaleAnchor(1e-8, 6000.0, 0.01)
     with pytest.raises(CalibrationError, match="at 2 magnifications"):
         calibrate_from_specimen([_blank(5000.0), _blank(7000.0)], known, display_width_m=0.1)
-    with pytest.raises(CalibrationError, match=r"gap from 7000x to 14000x"):
+    with pytest.raises(CalibrationError, match=r"gap in the ladder from 7000x to 14000x"):
         calibrate_from_specimen(
             [_blank(5000.0), _blank(7000.0), _blank(14000.0)], known, display_width_m=0.1
         )
