@@ -22,11 +22,12 @@ nothing says which it is, the image is refused.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array
+from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import (
     Agreement,
@@ -91,10 +92,12 @@ def keep_specimen(
     guess: Array,
     spread: Array | None,
     follow_px: Region | None = None,
+    suspected: MovingTiles | None = None,
 ) -> tuple[Alignment | Rejection[MatchFailure], CoarsePeak, MovingTiles | None, float] | None:
     """The alignment of the specimen alone where not all of the image moves with it; None where all does.
 
-    What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part.
+    What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part; ``suspected`` is
+    where something moved otherwise in the image before.
     """
     level = reference.levels[-1]
     noise = TileNoise.of(
@@ -127,13 +130,14 @@ def keep_specimen(
             np.array(start.shift_px),
             first,
             noise.reference,
-            lambda tiles: find_agreement(tiles, noise).weights,
+            _reweight(reference, noise, suspected, np.array(start.shift_px)),
         )
         if isinstance(tried, Rejection) or not tried.converged:
             continue
         statistics = tried.tile_statistics()
         assert statistics is not None
-        agreement = find_agreement(statistics, noise)
+        there = _suspected_tiles(reference, statistics, suspected, tried.shift_px)
+        agreement = find_agreement(statistics, noise, there)
         is_one = agreement.share >= _LEAST_SHARE and agreement.are_bodies
         if is_one and not any(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < _SAME_SHIFT_PX for h in found
@@ -163,6 +167,34 @@ def keep_specimen(
     if follow_px is not None:
         share = _share_inside(best.alignment, best.agreement, reference, follow_px)
     return best.alignment, best.start, shown, share
+
+
+def _reweight(
+    reference: Reference, noise: TileNoise, suspected: MovingTiles | None, shift_px: Array
+) -> Callable[[TileStatistics], Array]:
+    """Weights of tiles by their agreement near a shift."""
+    return lambda tiles: (
+        find_agreement(
+            tiles, noise, _suspected_tiles(reference, tiles, suspected, shift_px)
+        ).weights
+    )
+
+
+def _suspected_tiles(
+    reference: Reference,
+    statistics: TileStatistics,
+    suspected: MovingTiles | None,
+    shift_px: Array,
+) -> Mask | None:
+    """(rows, cols) the tiles that show at a shift what moved otherwise in the image before."""
+    if suspected is None:
+        return None
+    level = reference.levels[-1]
+    x, y = (
+        level.origin[axis] + level.side[axis] * (np.arange(n.start, n.stop) + 0.5) + shift_px[axis]
+        for axis, n in ((0, statistics.cols), (1, statistics.rows))
+    )
+    return suspected.at(x, y)
 
 
 def _choose_followed(
