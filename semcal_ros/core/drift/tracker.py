@@ -81,7 +81,6 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import similarity_matrix
 from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
-from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.register import Registration, register
 
@@ -256,7 +255,7 @@ class _Match:
             return self.fixed
         height, width = self.image.shape[:2]
         # Its edge may run through the tiles around.
-        around = grow_mask(moving.draw((width, height)) > 0, int(np.max(moving.side_px)))
+        around = moving.grown().draw((width, height)) > 0
         return around if self.fixed is None else around | self.fixed
 
 

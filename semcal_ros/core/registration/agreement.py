@@ -70,6 +70,8 @@ _LARGEST_STRETCH_PX = 0.3
 _FEW_DISAGREE, _BODY_TILES = 0.05, 4
 # A tile whose own shift is less certain than this says nothing by it.
 _TELLING_PX = 0.5
+# Of the terms of a shift that changes over the field, 1 / px^2: those that tiles in a row leave open are none.
+_LEAST_PRECISION = 1e-3
 # Where something moved in the image before, less of a shift is enough: px, and deviations of the mean of its tiles.
 _STILL_SHIFT_PX, _STILL_SIGMAS = 0.05, 3.0
 
@@ -288,12 +290,13 @@ def _moves(
         for _ in range(3):
             left = np.abs(value - design @ terms)
             good = fitted & (left <= 3.0 * max(float(np.median(left[fitted])), _OWN_SHIFT_PX))
-            scaled = design[good] / spread[good, None]
-            terms, *_ = np.linalg.lstsq(scaled, value[good] / spread[good], rcond=None)
+            scaled = design * (good / spread**2)[:, None]
+            inverse = np.linalg.inv(scaled.T @ design + _LEAST_PRECISION * np.eye(3))
+            terms = inverse @ (scaled.T @ value)
         value = _without_rows(value - design @ terms, known)
         left = np.abs(value)
         scatter = max(1.0, 1.4826 * float(np.median(left / sigma)))
-        uncertain = scatter * np.sqrt(float(np.linalg.pinv(scaled.T @ scaled)[1, 1]))
+        uncertain = scatter * np.sqrt(float(inverse[1, 1]))
         if abs(float(terms[1])) > _LARGEST_STRETCH_PX + _SIGMAS * uncertain:
             # What changes along a row is no drift: the specimen is strained or turned, and no part of it is a tool.
             return np.ones_like(found)
@@ -335,10 +338,17 @@ def _still_move(suspected: Mask, shifts: Array, precisions: Array) -> Mask:
 
 def _without_rows(values: Array, known: Mask) -> Array:
     """Shifts of the known tiles without what the tiles of a row share: lines of a scan jitter as a whole."""
-    grid = np.full(known.shape, np.nan)
+    grid = np.full(known.shape, np.inf)
     grid[known] = values
-    enough = np.count_nonzero(known, axis=1) >= _LEAST_TELLING // 2
-    grid[enough] -= np.nanmedian(grid[enough], axis=1, keepdims=True)
+    counts = np.count_nonzero(known, axis=1)
+    enough = counts >= _LEAST_TELLING // 2
+    # The median of what is known of each row, which sorts to its front: a tenth of the time of numpy.nanmedian.
+    ordered, middle = np.sort(grid[enough], axis=1), counts[enough] // 2
+    low, high = (
+        np.take_along_axis(ordered, at[:, None], axis=1)
+        for at in (middle - 1 + counts[enough] % 2, middle)
+    )
+    grid[enough] -= 0.5 * (low + high)
     return np.asarray(grid[known])
 
 
@@ -385,10 +395,10 @@ class MovingTiles:
             for at, first, side in zip((x, y), self.corner_px, self.side_px, strict=True)
         )
         height, width = self.tiles.shape
-        inside = np.outer((rows >= 0) & (rows < height), (cols >= 0) & (cols < width))
-        return np.asarray(
-            self.tiles[np.clip(rows, 0, height - 1)[:, None], np.clip(cols, 0, width - 1)] & inside
-        )
+        # None moves beyond the tiles.
+        padded = np.pad(self.tiles, 1)
+        rows, cols = np.clip(rows + 1, 0, height + 1), np.clip(cols + 1, 0, width + 1)
+        return np.asarray(padded.take(rows, axis=0).take(cols, axis=1))
 
     def draw(
         self, size: tuple[int, int], *, moved_px: Array | None = None, scale: float = 1.0
@@ -399,4 +409,9 @@ class MovingTiles:
         """
         moved = np.zeros(2) if moved_px is None else moved_px
         x, y = ((np.arange(n) + 0.5) / scale - 0.5 - by for n, by in zip(size, moved, strict=True))
-        return np.where(self.at(x, y), np.uint8(255), np.uint8(0))
+        return np.asarray(self.at(x, y).view(np.uint8) * np.uint8(255))
+
+    def grown(self) -> MovingTiles:
+        """The same with all tiles around."""
+        tiles = cv2.dilate(np.pad(self.tiles, 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        return replace(self, tiles=tiles, corner_px=self.corner_px - self.side_px)

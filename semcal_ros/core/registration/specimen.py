@@ -22,9 +22,9 @@ nothing says which it is, the image is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
@@ -124,20 +124,20 @@ def keep_specimen(
             for h in found
         ):
             continue
+        judge = _Judge(reference, noise, suspected, np.array(start.shift_px))
         tried = align_reweighted(
             level,
             pyramid,
             np.array(start.shift_px),
-            first,
+            judge.first(first),
             noise.reference,
-            _reweight(reference, noise, suspected, np.array(start.shift_px)),
+            judge,
+            looks=suspected is None,
         )
         if isinstance(tried, Rejection) or not tried.converged:
             continue
-        statistics = tried.tile_statistics()
-        assert statistics is not None
-        there = _suspected_tiles(reference, statistics, suspected, tried.shift_px)
-        agreement = find_agreement(statistics, noise, there)
+        agreement = judge.latest
+        assert agreement is not None
         is_one = agreement.share >= _LEAST_SHARE and agreement.are_bodies
         if is_one and not any(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < _SAME_SHIFT_PX for h in found
@@ -169,32 +169,41 @@ def keep_specimen(
     return best.alignment, best.start, shown, share
 
 
-def _reweight(
-    reference: Reference, noise: TileNoise, suspected: MovingTiles | None, shift_px: Array
-) -> Callable[[TileStatistics], Array]:
-    """Weights of tiles by their agreement near a shift."""
-    return lambda tiles: (
-        find_agreement(
-            tiles, noise, _suspected_tiles(reference, tiles, suspected, shift_px)
-        ).weights
-    )
+class _Judge:
+    """Which tiles agree near a shift, of an image in which something may move where it did so in the image before."""
 
+    def __init__(
+        self,
+        reference: Reference,
+        noise: TileNoise,
+        suspected: MovingTiles | None,
+        shift_px: Array,
+    ) -> None:
+        level, self._noise = reference.levels[-1], noise
+        self.latest: Agreement | None = None
+        self._suspected: Mask | None = None
+        if suspected is not None:
+            rows, cols = level.normal_matrices.shape[:2]
+            x, y = (
+                origin + side * (np.arange(count) + 0.5) + shift
+                for origin, side, count, shift in zip(
+                    level.origin, level.side, (cols, rows), shift_px.tolist(), strict=True
+                )
+            )
+            self._suspected = suspected.at(x, y)
 
-def _suspected_tiles(
-    reference: Reference,
-    statistics: TileStatistics,
-    suspected: MovingTiles | None,
-    shift_px: Array,
-) -> Mask | None:
-    """(rows, cols) the tiles that show at a shift what moved otherwise in the image before."""
-    if suspected is None:
-        return None
-    level = reference.levels[-1]
-    x, y = (
-        level.origin[axis] + level.side[axis] * (np.arange(n.start, n.stop) + 0.5) + shift_px[axis]
-        for axis, n in ((0, statistics.cols), (1, statistics.rows))
-    )
-    return suspected.at(x, y)
+    def first(self, weights: Array) -> Array:
+        """Weights (rows, cols) to begin with, without what is suspected and what lies around it."""
+        if self._suspected is None:
+            return weights
+        around = cv2.dilate(self._suspected.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        return np.where(around, 0.0, weights)
+
+    def __call__(self, tiles: TileStatistics) -> Array:
+        """Weights of the compared tiles."""
+        there = None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
+        self.latest = find_agreement(tiles, self._noise, there)
+        return self.latest.weights
 
 
 def _choose_followed(
