@@ -70,6 +70,7 @@ from semcal_ros.core.drift.measurement import (
 )
 from semcal_ros.core.drift.operations import CorrectShear, Inflate, Marginalise, Measure, Predict
 from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.own_motion import BodyFrame, OwnMotion, OwnMotionEstimator
 from semcal_ros.core.drift.similarity import (
     SimilarityMatch,
     SimilarityTracker,
@@ -155,7 +156,8 @@ class _Track:
     ``camera`` and ``time_s`` are those of the latest frame, ``sample`` is some of its pixels, and
     ``rejected`` is the number of frames in a row that did not match. ``doubt`` (2, 2) is what the last
     frames that contradict the prediction add to the covariance of the drift, until one matches. ``moving`` is what
-    did not move with the specimen in the last frame that matched. ``before`` is the last frame as it came,
+    did not move with the specimen in the last frame that matched, ``own_motion`` its motion, measured by ``body``.
+    ``before`` is the last frame as it came,
     ``overlay`` what is drawn into all of them, of which there were ``seen``, and ``fixed`` what else stays in place.
     Where the specimen shows lines only,
     ``along`` (2,) is their direction in px, ``unseen`` what was known before the first frame that did not tell the
@@ -172,6 +174,8 @@ class _Track:
     rejected: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
     moving: MovingTiles | None = None
+    own_motion: OwnMotion | None = None
+    body: OwnMotionEstimator = field(default_factory=OwnMotionEstimator)
     before: AnyImage | None = None
     overlay: Mask | None = None
     seen: int = 0
@@ -840,6 +844,7 @@ class DriftTracker:
         track.outliers.reset(state)
         registration, candidate = match.registration, match.candidate
         track.moving = registration.moving
+        track.own_motion = self._follow_body(track, frame, match)
         if candidate.ratio > _SMALL_ZOOM:
             return _make_update(track, frame, DriftStatus.KEYFRAME, registration=registration)
         store.use(candidate.key)
@@ -866,6 +871,17 @@ class DriftTracker:
         update = _make_update(track, frame, status, registration=registration)
         return replace(update, keyframe_time_s=match.keyframe_time_s, merged=merged)
 
+    def _follow_body(self, track: _Track, frame: ScanFrame, match: _Match) -> OwnMotion | None:
+        """The own motion of what does not move with the specimen."""
+        moving, state = match.registration.moving, track.filter.state
+        if moving is None or track.similarity.is_active:
+            return track.body.update(None)
+        return track.body.update(
+            BodyFrame(
+                match.image, match.region, moving, state.position, frame.px_from_unit, state.time_s
+            )
+        )
+
     def _coast(
         self, track: _Track, frame: ScanFrame, rejected: list[_RejectedMatch], rescaled: bool
     ) -> DriftUpdate:
@@ -877,6 +893,7 @@ class DriftTracker:
         doubt = self._doubt(track, frame, rejected)
         if doubt is not None:
             track.doubt = doubt
+        track.own_motion = track.body.update(None)
         # A blanked beam says nothing about the keyframe.
         is_of_keyframe = rejection.status not in IMAGE_FAILURES
         track.rejected += is_of_keyframe
@@ -1062,6 +1079,7 @@ def _make_update(
         unseen=unseen,
         along=track.along,
         moving=None if registration is None else registration.moving,
+        own_motion=track.own_motion,
         fixed=None if frame.fixed is None else MovingTiles.of_pixels(frame.fixed),
         of_scale=of_scale[:2, :2],
     )

@@ -40,6 +40,7 @@ __all__ = [
     "Agreement",
     "MovingTiles",
     "TileNoise",
+    "fill_bodies",
     "find_agreement",
     "information_weights",
     "keep_bodies",
@@ -201,7 +202,7 @@ def find_agreement(
     # By area: a bright tool has more of a gradient than all of the ground.
     share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
-    body = _fill(keep_bodies(disagrees, _BODY_TILES))
+    body = fill_bodies(keep_bodies(disagrees, _BODY_TILES))
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * np.trace(tiles.gradient, axis1=-2, axis2=-1)
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
@@ -230,16 +231,17 @@ def _bound_gain(tiles: TileStatistics, noise: TileNoise, weights: Array) -> Arra
     return np.clip(gain, middle / _GAIN_RANGE, middle * _GAIN_RANGE)
 
 
-def _fill(disagrees: Mask) -> Mask:
-    """Tiles without holes: none between tiles that disagree, and none that they enclose."""
+def fill_bodies(found: Mask, gap: int = 3) -> Mask:
+    """A mask (h, w) without holes: none between parts less than ``gap`` apart, and none that they enclose."""
     # A body may come in over the edge: what it encloses with the edge is inside, too.
-    rows, cols = disagrees.shape
+    rows, cols = found.shape
+    edge = gap // 2 + 1
     joined = cv2.morphologyEx(
-        np.pad(disagrees.astype(np.uint8), 2), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)
+        np.pad(found.astype(np.uint8), edge), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8)
     )
     contours, _ = cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     drawn = cv2.drawContours(np.zeros_like(joined), contours, -1, 1, cv2.FILLED)
-    return np.asarray(drawn[2 : 2 + rows, 2 : 2 + cols] > 0)
+    return np.asarray(drawn[edge : edge + rows, edge : edge + cols] > 0)
 
 
 def _moves(
@@ -326,7 +328,7 @@ def _still_move(suspected: Mask, shifts: Array, precisions: Array) -> Mask:
     for shift, precision in zip(shifts, precisions, strict=True):
         total = np.bincount(labels.ravel(), precision.ravel(), count)
         mean = np.bincount(labels.ravel(), (precision * shift).ravel(), count)
-        mean /= np.maximum(total, 1e-30)
+        mean = mean / np.maximum(total, 1e-30)
         is_shift = np.abs(mean) > _STILL_SHIFT_PX + _STILL_SIGMAS / np.sqrt(
             np.maximum(total, 1e-30)
         )
@@ -374,7 +376,7 @@ class MovingTiles:
     @classmethod
     def of(cls, disagrees: Mask, corner_px: Array, side_px: Array) -> MovingTiles:
         """From the tiles that disagree: a body has no holes, and is more than one tile."""
-        filled = _fill(keep_bodies(disagrees, _LEAST_TILES))
+        filled = fill_bodies(keep_bodies(disagrees, _LEAST_TILES))
         return cls(filled, corner_px, side_px, float(filled.mean()))
 
     @classmethod
