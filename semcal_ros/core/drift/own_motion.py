@@ -48,6 +48,8 @@ __all__ = ["BodyFrame", "OwnMotion", "OwnMotionEstimator"]
 # frames after which a slower one is compared all the same, and frames without a measurement after each: it takes as
 # long as the drift of a frame without a tool.
 _LEAST_APART_PX, _MOST_FRAMES, _REST_FRAMES = 1.5, 12, 3
+# Frames after which a body is searched for, and the longest rest after it was not found again and again.
+_SEARCHES, _LONGEST_REST = (1, 3, 6), 24
 # How far a body whose motion is not known yet may have moved between two frames, and others beyond the expected, px.
 _REACH_PX, _BEYOND_PX = 16, 3.0
 # What is compared around a body, and the least side of it: tiles need some 50 px.
@@ -128,6 +130,7 @@ class OwnMotionEstimator:
         self._base: BodyFrame | None = None
         self._since = 0
         self._rest = 0
+        self._failures = 0
         self._guess: OwnMotion | None = None
         self._latest: OwnMotion | None = None
 
@@ -138,7 +141,7 @@ class OwnMotionEstimator:
         """
         if frame is None:
             self._base = self._guess = self._latest = None
-            self._since = self._rest = 0
+            self._since = self._rest = self._failures = 0
             return None
         base = self._base
         if base is None or not _are_comparable(base, frame):
@@ -157,8 +160,10 @@ class OwnMotionEstimator:
             is_near = float(np.hypot(*(expected_px - moved_px))) < _LEAST_APART_PX
             if is_near and self._since < _MOST_FRAMES:
                 return self._latest
+        elif self._since not in _SEARCHES:
+            return None
         found = measure_displacement(base, frame, moved_px, expected_px)
-        if found is None and expected_px is None and self._since < _MOST_FRAMES // 2:
+        if found is None and expected_px is None and self._since < _SEARCHES[-1]:
             # It may be a slow one.
             return None
         before, self._guess, self._latest = self._guess, None, None
@@ -173,7 +178,10 @@ class OwnMotionEstimator:
             )
             if before is not None and _is_confirmed(before, self._guess, interval_s, frame):
                 self._latest = self._guess
+        self._failures = self._failures + 1 if found is None else 0
         self._base, self._rest = None, 0 if self._latest is None else _REST_FRAMES
+        if found is None:
+            self._rest = min(_REST_FRAMES * 2**self._failures, _LONGEST_REST)
         return self._latest
 
 

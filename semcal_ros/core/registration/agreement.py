@@ -327,8 +327,8 @@ def _still_move(suspected: Mask, shifts: Array, precisions: Array) -> Mask:
     by_mean, of_mean = np.zeros(suspected.shape), np.zeros(suspected.shape)
     for shift, precision in zip(shifts, precisions, strict=True):
         total = np.bincount(labels.ravel(), precision.ravel(), count)
-        mean = np.bincount(labels.ravel(), (precision * shift).ravel(), count)
-        mean = mean / np.maximum(total, 1e-30)
+        weighted = np.bincount(labels.ravel(), (precision * shift).ravel(), count)
+        mean = np.asarray(weighted, dtype=np.float64) / np.maximum(total, 1e-30)
         is_shift = np.abs(mean) > _STILL_SHIFT_PX + _STILL_SIGMAS / np.sqrt(
             np.maximum(total, 1e-30)
         )

@@ -259,7 +259,7 @@ class DriftOutput:
         self._coasting += not (measured.accepted or drift.is_forecast)
         self._forecast += drift.is_forecast
         self.trouble = "" if measured.accepted else f"drift {measured.status_text}"
-        notes = (
+        notes: tuple[tuple[str, float | str], ...] = (
             ("drift_status", measured.status_text),
             ("drift_residual", float(measured.residual)),
             ("drift_overlap", float(measured.overlap)),
