@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
+from semcal_ros.core.drift.own_motion import OwnMotion
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.similarity import SimilarityPredictor, turn_drift
 from semcal_ros.core.drift.state import MOTION_SIZE, DriftState
@@ -212,6 +213,9 @@ class DriftUpdate(DriftEstimate):
     moving
         What does not move with the specimen, in px of the rectified frame before its drift is removed; None where
         nothing was found.
+    own_motion
+        How the largest body of it moves, as it was measured last; None where nothing moves by itself, or its motion is
+        not determined (:mod:`semcal_ros.core.drift.own_motion`).
     fixed
         What stays in place while the specimen drifts, such as a data bar or a burnt spot of the detector, and was left
         out; in the same px. None where nothing was found.
@@ -235,6 +239,7 @@ class DriftUpdate(DriftEstimate):
     along: Array | None = field(default=None, kw_only=True)
     unseen: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     moving: MovingTiles | None = field(default=None, kw_only=True)
+    own_motion: OwnMotion | None = field(default=None, kw_only=True)
     fixed: MovingTiles | None = field(default=None, kw_only=True)
     of_scale: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 

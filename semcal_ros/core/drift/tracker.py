@@ -59,7 +59,7 @@ from semcal_ros.core.drift.gating import (
 )
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.keyframe import Keyframe, make_keyframe
-from semcal_ros.core.drift.keyframe_store import Candidate, KeyframeStore
+from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS, Candidate, KeyframeStore
 from semcal_ros.core.drift.measurement import (
     add_zoom_uncertainty,
     clone_keyframe,
@@ -70,6 +70,7 @@ from semcal_ros.core.drift.measurement import (
 )
 from semcal_ros.core.drift.operations import CorrectShear, Inflate, Marginalise, Measure, Predict
 from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.own_motion import BodyFrame, OwnMotion, OwnMotionEstimator
 from semcal_ros.core.drift.similarity import (
     SimilarityMatch,
     SimilarityTracker,
@@ -125,6 +126,11 @@ _FIRST_LOOKS, _LOOK_EVERY = 3, 8
 _FIXED_FIRST, _FIXED_LATER = 4, 32
 # Part of the image that must newly be found to stay, for keyframes to be freed of it.
 _NEWLY_FIXED = 2e-4
+# What moves by less than this against the specimen may not have been found, and has pulled by a part of it at most, px.
+_MOST_PULLED_PX = 0.3
+# Chi-square (2 degrees of freedom) from which a mean is of frames that were pulled: of others, one in a hundred, which
+# costs a few frames until there is a mean again.
+_PULLED_CHI2 = 9.2
 # What an image looks like that shows another place: the prediction need not hold.
 _ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
 
@@ -149,8 +155,9 @@ class _Track:
 
     ``camera`` and ``time_s`` are those of the latest frame, ``sample`` is some of its pixels, and
     ``rejected`` is the number of frames in a row that did not match. ``doubt`` (2, 2) is what the last
-    frames that contradict the prediction add to the covariance of the drift, until one matches. ``apart`` says whether
-    something in the last frame that matched did not move with the specimen. ``before`` is the last frame as it came,
+    frames that contradict the prediction add to the covariance of the drift, until one matches. ``moving`` is what
+    did not move with the specimen in the last frame that matched, ``own_motion`` its motion, measured by ``body``.
+    ``before`` is the last frame as it came,
     ``overlay`` what is drawn into all of them, of which there were ``seen``, and ``fixed`` what else stays in place.
     Where the specimen shows lines only,
     ``along`` (2,) is their direction in px, ``unseen`` what was known before the first frame that did not tell the
@@ -166,7 +173,9 @@ class _Track:
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
-    apart: bool = False
+    moving: MovingTiles | None = None
+    own_motion: OwnMotion | None = None
+    body: OwnMotionEstimator = field(default_factory=OwnMotionEstimator)
     before: AnyImage | None = None
     overlay: Mask | None = None
     seen: int = 0
@@ -241,6 +250,17 @@ class _Match:
     measure: Measure
     keyframe_time_s: float
     similarity: SimilarityMatch
+
+    @property
+    def apart(self) -> Mask | None:
+        """(h, w) the pixels of the image that do not show the specimen, what moves among them; None where all do."""
+        moving = self.registration.moving
+        if moving is None:
+            return self.fixed
+        height, width = self.image.shape[:2]
+        # Its edge may run through the tiles around.
+        around = moving.grown().draw((width, height)) > 0
+        return around if self.fixed is None else around | self.fixed
 
 
 @dataclass(frozen=True)
@@ -423,11 +443,13 @@ class DriftTracker:
 
     def _remake_keyframe(self, track: _Track, key: int, frame: ScanFrame, removed: Array) -> None:
         """Replace a keyframe by one of a single frame, freed of a motion."""
-        old = track.store[key]
+        track.store.replace(key, self._single(frame, removed, track.store[key]))
+
+    def _single(self, frame: ScanFrame, removed: Array, old: Keyframe) -> Keyframe:
+        """A keyframe of a single frame, freed of a motion, in the place of another one."""
         image, region = self._corrector.corrected_image(frame, removed, old.turn)
         fixed = self._corrector.corrected_mask(frame, removed, old.turn)
-        keyframe = make_keyframe(frame, removed, image, region, old.time_s, old.turn, fixed)
-        track.store.replace(key, keyframe)
+        return make_keyframe(frame, removed, image, region, old.time_s, old.turn, fixed)
 
     # -- the first frame --------------------------------------------------------------------------
 
@@ -527,6 +549,7 @@ class DriftTracker:
                 repeated = Rejection(MatchFailure.REPEATED_IMAGE, reason)
                 match = _RejectedMatch(repeated, match.registration)
             if isinstance(match, _Match):
+                match = self._free_of_pull(track, frame, match)
                 refused = self._use(track, frame, match)
                 if refused is None:
                     return self._finish(track, frame, match)
@@ -604,8 +627,52 @@ class DriftTracker:
                 self._forget_mean(track, other)
         return match
 
+    def _free_of_pull(self, track: _Track, frame: ScanFrame, match: _Match) -> _Match:
+        """The match against means that nothing has pulled, where something is found to move by itself.
+
+        As long as it had moved by little, it was taken for the specimen, and pulled the frames that were added to a
+        mean. Where the first frame of the keyframe asks for another shift than the mean does, all means are given up.
+        """
+        key, before = match.candidate.key, match.registration
+        old = track.store[key]
+        is_new = track.moving is None or old.averaged in MEAN_COUNTS
+        if before.moving is None or not is_new or match.candidate.rescaled or old.averaged == 1:
+            return match
+        first = self._single(old.frame, old.removed, old).prepare_reference(
+            self.settings.registration
+        )
+        found = register(
+            first,
+            match.image,
+            guess_px=before.shift_px,
+            guess_covariance=before.covariance + np.eye(2) * _MOST_PULLED_PX**2,
+            image_region=match.region,
+            max_shear_px=_MAX_SHEAR * frame.size[1],
+            suspected=before.moving,
+            fixed=match.fixed,
+        )
+        pulled_px = found.shift_px - before.shift_px
+        if (
+            not found.accepted
+            or float(pulled_px @ np.linalg.solve(found.covariance, pulled_px)) < _PULLED_CHI2
+        ):
+            return match
+        means = {k: track.store[k] for k in track.store.keys}
+        for k in means:
+            self._forget_mean(track, k)
+        again = self._match_once(
+            track, frame, match.candidate, match.removed, match.similarity.turn
+        )
+        if isinstance(again, _RejectedMatch):
+            for k, mean in means.items():
+                track.store.replace(k, mean)
+            return match
+        pulled = np.linalg.solve(frame.px_from_unit, pulled_px)
+        track.filter.widen_measurements(np.outer(pulled, pulled))
+        return again
+
     def _forget_mean(self, track: _Track, key: int) -> None:
-        """Go back to the first frame of a keyframe: the mean is of frames that were turned."""
+        """Go back to the first frame of a keyframe: the mean is of frames that were turned, or pulled."""
         old = track.store[key]
         if old.averaged > 1:
             self._remake_keyframe(track, key, old.frame, old.removed)
@@ -634,7 +701,7 @@ class DriftTracker:
             guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
             image_region=region,
             max_shear_px=_MAX_SHEAR * frame.size[1],
-            apart=track.apart,
+            suspected=track.moving,
             takes_lines=True,
             fixed=fixed,
         )
@@ -776,7 +843,8 @@ class DriftTracker:
         track.doubt = np.zeros((2, 2))
         track.outliers.reset(state)
         registration, candidate = match.registration, match.candidate
-        track.apart = registration.moving is not None
+        track.moving = registration.moving
+        track.own_motion = self._follow_body(track, frame, match)
         if candidate.ratio > _SMALL_ZOOM:
             return _make_update(track, frame, DriftStatus.KEYFRAME, registration=registration)
         store.use(candidate.key)
@@ -797,11 +865,22 @@ class DriftTracker:
         elif self.settings.average and track.unseen is None and _is_mergeable(match, store):
             # Not of lines alone: what came into the picture since would be where it was predicted to be.
             keyframe = store[candidate.key]
-            mean = keyframe.with_frame(match.image, match.region, registration, match.fixed)
+            mean = keyframe.with_frame(match.image, match.region, registration, match.apart)
             store.replace(candidate.key, mean)
             merged = True
         update = _make_update(track, frame, status, registration=registration)
         return replace(update, keyframe_time_s=match.keyframe_time_s, merged=merged)
+
+    def _follow_body(self, track: _Track, frame: ScanFrame, match: _Match) -> OwnMotion | None:
+        """The own motion of what does not move with the specimen."""
+        moving, state = match.registration.moving, track.filter.state
+        if moving is None or track.similarity.is_active:
+            return track.body.update(None)
+        return track.body.update(
+            BodyFrame(
+                match.image, match.region, moving, state.position, frame.px_from_unit, state.time_s
+            )
+        )
 
     def _coast(
         self, track: _Track, frame: ScanFrame, rejected: list[_RejectedMatch], rescaled: bool
@@ -814,6 +893,7 @@ class DriftTracker:
         doubt = self._doubt(track, frame, rejected)
         if doubt is not None:
             track.doubt = doubt
+        track.own_motion = track.body.update(None)
         # A blanked beam says nothing about the keyframe.
         is_of_keyframe = rejection.status not in IMAGE_FAILURES
         track.rejected += is_of_keyframe
@@ -999,6 +1079,7 @@ def _make_update(
         unseen=unseen,
         along=track.along,
         moving=None if registration is None else registration.moving,
+        own_motion=track.own_motion,
         fixed=None if frame.fixed is None else MovingTiles.of_pixels(frame.fixed),
         of_scale=of_scale[:2, :2],
     )

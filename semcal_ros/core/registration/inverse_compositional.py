@@ -445,6 +445,8 @@ def align_reweighted(
     weights: Array,
     noise: float,
     reweight: Callable[[TileStatistics], Array],
+    *,
+    looks: bool = True,
 ) -> Alignment | Rejection[MatchFailure]:
     """Refine a shift by those tiles that agree with it.
 
@@ -461,7 +463,9 @@ def align_reweighted(
     noise
         Variance of its noise per pixel, after smoothing.
     reweight
-        From the statistics of the compared tiles to their weights.
+        From the statistics of the compared tiles to their weights. What it was asked last is where the shift was found.
+    looks
+        Whether to look at the tiles at the start before the first step; not where the first weights tell what moves.
 
     Returns
     -------
@@ -470,7 +474,7 @@ def align_reweighted(
     shift, passes = np.asarray(start_px, dtype=np.float64), 0
     weights, converged = weights.copy(), False
     # A bright tool would pull the first step to where it went, or leave none.
-    first = _look_at_tiles(level, image, shift / level.factor)
+    first = _look_at_tiles(level, image, shift / level.factor) if looks else None
     if first is not None:
         found = reweight(first)
         if np.count_nonzero(found) >= _MIN_BLOCKS:

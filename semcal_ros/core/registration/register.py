@@ -376,7 +376,7 @@ def register(
     guess_covariance: ArrayLike | None = None,
     image_region: Region | None = None,
     max_shear_px: float = 0.0,
-    apart: bool = False,
+    suspected: MovingTiles | None = None,
     takes_lines: bool = False,
     fixed: Mask | None = None,
 ) -> Registration:
@@ -396,9 +396,9 @@ def register(
     max_shear_px
         Largest shear that may be due to drift during the scan. Up to it the upper and the lower
         half of the image may disagree in proportion.
-    apart
-        Whether something in the image is expected to move apart from the specimen, as in the image before. It is
-        found without, which takes twice as long.
+    suspected
+        Where something moved apart from the specimen in the image before, and may still do so; None where nothing did.
+        It is found without, which takes twice as long, and a slow one later.
     takes_lines
         Whether a shift across lines is of use, with the predicted one along them (:attr:`Registration.along`). It is
         measured only where there is a covariance of the prediction.
@@ -426,7 +426,7 @@ def register(
             guess_covariance=guess_covariance,
             image_region=image_region,
             max_shear_px=max_shear_px,
-            apart=apart,
+            suspected=suspected,
         )
         away_px = np.abs(found.shift_px - dropped_at)
         if part is reference or not np.any(away_px > _DROPPED_WITHIN_PX):
@@ -526,7 +526,7 @@ def _register(
     guess_covariance: ArrayLike | None,
     image_region: Region | None,
     max_shear_px: float,
-    apart: bool,
+    suspected: MovingTiles | None,
 ) -> Registration:
     """Measure a shift in both directions."""
     gray, inside = _crop(image, image_region)
@@ -539,7 +539,7 @@ def _register(
     guess = np.asarray(guess_px, dtype=np.float64) - origin
     pyramid = Pyramid(gray)
     moving: MovingTiles | None = None
-    of_parts = reference.is_sparse or apart
+    of_parts = reference.is_sparse or suspected is not None
     peaks = find_coarse_peaks(reference.coarse, pyramid, guess)
     if not peaks:
         found = explain_mismatch(reference.coarse, pyramid, guess)
@@ -590,7 +590,11 @@ def _register(
     whole = None if repeats or of_parts else look_at_whole(reference, alignment, image_noise)
     kept = None
     if not repeats and (whole is None or not whole.is_complete):
-        kept = keep_specimen(reference, pyramid, alignment, peak, peaks, guess, spread, follow_px)
+        if suspected is not None:
+            suspected = replace(suspected, corner_px=suspected.corner_px - np.array(inside[:2]))
+        kept = keep_specimen(
+            reference, pyramid, alignment, peak, peaks, guess, spread, follow_px, suspected
+        )
     if kept is None and isinstance(chosen, Rejection):
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(distances))].shift_px) + origin

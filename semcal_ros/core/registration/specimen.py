@@ -24,9 +24,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array
+from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import (
     Agreement,
@@ -91,10 +92,12 @@ def keep_specimen(
     guess: Array,
     spread: Array | None,
     follow_px: Region | None = None,
+    suspected: MovingTiles | None = None,
 ) -> tuple[Alignment | Rejection[MatchFailure], CoarsePeak, MovingTiles | None, float] | None:
     """The alignment of the specimen alone where not all of the image moves with it; None where all does.
 
-    What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part.
+    What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part; ``suspected`` is
+    where something moved otherwise in the image before.
     """
     level = reference.levels[-1]
     noise = TileNoise.of(
@@ -121,19 +124,20 @@ def keep_specimen(
             for h in found
         ):
             continue
+        judge = _Judge(reference, noise, suspected, np.array(start.shift_px))
         tried = align_reweighted(
             level,
             pyramid,
             np.array(start.shift_px),
-            first,
+            judge.first(first),
             noise.reference,
-            lambda tiles: find_agreement(tiles, noise).weights,
+            judge,
+            looks=suspected is None,
         )
         if isinstance(tried, Rejection) or not tried.converged:
             continue
-        statistics = tried.tile_statistics()
-        assert statistics is not None
-        agreement = find_agreement(statistics, noise)
+        agreement = judge.latest
+        assert agreement is not None
         is_one = agreement.share >= _LEAST_SHARE and agreement.are_bodies
         if is_one and not any(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < _SAME_SHIFT_PX for h in found
@@ -163,6 +167,43 @@ def keep_specimen(
     if follow_px is not None:
         share = _share_inside(best.alignment, best.agreement, reference, follow_px)
     return best.alignment, best.start, shown, share
+
+
+class _Judge:
+    """Which tiles agree near a shift, of an image in which something may move where it did so in the image before."""
+
+    def __init__(
+        self,
+        reference: Reference,
+        noise: TileNoise,
+        suspected: MovingTiles | None,
+        shift_px: Array,
+    ) -> None:
+        level, self._noise = reference.levels[-1], noise
+        self.latest: Agreement | None = None
+        self._suspected: Mask | None = None
+        if suspected is not None:
+            rows, cols = level.normal_matrices.shape[:2]
+            x, y = (
+                origin + side * (np.arange(count) + 0.5) + shift
+                for origin, side, count, shift in zip(
+                    level.origin, level.side, (cols, rows), shift_px.tolist(), strict=True
+                )
+            )
+            self._suspected = suspected.at(x, y)
+
+    def first(self, weights: Array) -> Array:
+        """Weights (rows, cols) to begin with, without what is suspected and what lies around it."""
+        if self._suspected is None:
+            return weights
+        around = cv2.dilate(self._suspected.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        return np.where(around, 0.0, weights)
+
+    def __call__(self, tiles: TileStatistics) -> Array:
+        """Weights of the compared tiles."""
+        there = None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
+        self.latest = find_agreement(tiles, self._noise, there)
+        return self.latest.weights
 
 
 def _choose_followed(

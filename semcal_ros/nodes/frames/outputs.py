@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,7 @@ from semcal_ros.nodes.frames.compressed import CompressedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame
 
 if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node without drift does not
+    from semcal_ros.core.drift.estimates import DriftUpdate
     from semcal_ros.nodes.frames.live_drift import FrameDrift
 
 __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
@@ -257,14 +259,29 @@ class DriftOutput:
         self._coasting += not (measured.accepted or drift.is_forecast)
         self._forecast += drift.is_forecast
         self.trouble = "" if measured.accepted else f"drift {measured.status_text}"
-        notes = (
+        notes: tuple[tuple[str, float | str], ...] = (
             ("drift_status", measured.status_text),
             ("drift_residual", float(measured.residual)),
             ("drift_overlap", float(measured.overlap)),
             ("drift_moving_share", 0.0 if measured.moving is None else measured.moving.share),
+            *_own_motion_notes(measured),
             ("drift_fixed_share", measured.fixed_share),
             ("drift_frames_coasted", self._coasting),
             ("drift_frames_forecast", self._forecast),
         )
         for key, value in notes:
             self._reporter.note(key, value)
+
+
+def _own_motion_notes(measured: DriftUpdate) -> tuple[tuple[str, float], ...]:
+    """Velocity of what moves by itself and its 1-sigma along the worse direction; not a number where not determined."""
+    own = measured.own_motion
+    vx, vy = (math.nan, math.nan) if own is None else own.velocity_m_s.tolist()
+    sigma = math.nan
+    if own is not None:
+        sigma = math.sqrt(float(np.linalg.eigvalsh(own.covariance)[-1]))
+    return (
+        ("drift_moving_velocity_x", vx),
+        ("drift_moving_velocity_y", vy),
+        ("drift_moving_velocity_sigma", sigma),
+    )

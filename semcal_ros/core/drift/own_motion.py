@@ -1,0 +1,394 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The motion of what does not move with the specimen, such as a tool.
+
+A body that moves is known by tiles only, and the ground that they show at its edge would pull its motion towards that
+of the specimen. So two frames are compared pixel by pixel, at the shift of the specimen and at that of the body: what
+disagrees with the first, and agrees better with the second, is the body, filled. Its shift is refined by these pixels.
+How much of the ground is still among them is told by a second look, with a ring of more ground around them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.agreement import MovingTiles, fill_bodies
+from semcal_ros.core.registration.fixed_pixels import grow_mask
+from semcal_ros.core.registration.inverse_compositional import Alignment, align_reweighted
+from semcal_ros.core.registration.noise_spectrum import (
+    estimate_noise_variance,
+    passed_variance,
+    smooth,
+)
+from semcal_ros.core.registration.reference import Region
+from semcal_ros.core.registration.register import to_gray
+from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel, drop_pixels, make_level
+
+__all__ = ["BodyFrame", "OwnMotion", "OwnMotionEstimator"]
+
+
+# By how much a body must have moved against the specimen, px, before its pixels are told from those of the ground;
+# frames after which a slower one is compared all the same, and frames without a measurement after each: it takes as
+# long as the drift of a frame without a tool.
+_LEAST_APART_PX, _MOST_FRAMES, _REST_FRAMES = 1.5, 12, 3
+# Frames after which a body is searched for, and the longest rest after it was not found again and again.
+_SEARCHES, _LONGEST_REST = (1, 3, 6), 24
+# How far a body whose motion is not known yet may have moved between two frames, and others beyond the expected, px.
+_REACH_PX, _BEYOND_PX = 16, 3.0
+# What is compared around a body, and the least side of it: tiles need some 50 px.
+_MARGIN_PX, _LEAST_SIDE_PX = 10, 48
+# Smoothing of both images, px, and the squared difference over that of the noise from which a square of 3 px
+# disagrees: of some two independent differences, one in 400. Single squares are no body.
+_SMOOTHED_PX, _DISAGREES, _SQUARE_PX, _LEAST_PIXELS = 1.0, 6.0, 3, 40
+# What confirms a measurement: one before that differs by less than so many deviations, or px between two frames.
+_CONFIRMED_SIGMAS, _CHANGE_PX = 3.0, 0.3
+# Gaps in the outline of a body up to which it is one, px.
+_GAP_PX = 7
+# Pixels of a tile that make it count.
+_LEAST_OF_TILE = 8
+# Width of the ring of the second look, px, and which part of what it changes the ground may have pulled the first look
+# by: the pixels that were taken for the body reach some 2 px beyond its edge. Found by drawn bodies, whose errors are
+# then 0.5 to 1.3 of the stated sigma.
+_RING_PX, _PART_OF_RING = 3, 0.6
+# Errors of interpolation at an edge, px.
+_FLOOR_PX = 0.02
+# A body shows itself again as bright, without much else, in its halves alike, and moves otherwise than the ground. A
+# larger sigma, px, is that of something else: a body that turns, two bodies, or a shadow.
+_GAINS, _MOST_LEFT, _HALF_SIGMAS, _APART_SIGMAS, _MOST_SIGMA_PX = (0.9, 1.1), 5.0, 4.0, 3.0, 0.3
+
+
+@dataclass(frozen=True)
+class OwnMotion:
+    """Motion of the largest body that does not move with the specimen.
+
+    Attributes
+    ----------
+    velocity_m_s
+        (2,) displacement per s between two frames: what of the body lay at X is seen at ``X + velocity_m_s dt``, in the
+        axes of the drift. It is not relative to the specimen, whose own velocity is that of the drift. In px per s
+        where there is no camera.
+    covariance
+        (2, 2) of it.
+    begin_s, end_s
+        Centres of the acquisitions of the two frames, of which the later one may be some frames ago.
+    """
+
+    velocity_m_s: Array
+    covariance: Array
+    begin_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class BodyFrame:
+    """A frame in which something moves by itself.
+
+    Attributes
+    ----------
+    image, region
+        (h, w) or (h, w, 3) in rectified px, without the motion of the specimen during its scan, and the part of it that
+        was scanned.
+    moving
+        Where something moves.
+    drift
+        (2,) drift of the specimen.
+    px_from_unit
+        (2, 2) px per unit of the drift.
+    time_s
+        Centre of its acquisition.
+    """
+
+    image: AnyImage
+    region: Region
+    moving: MovingTiles
+    drift: Array
+    px_from_unit: Array
+    time_s: float
+
+
+class OwnMotionEstimator:
+    """Measures the own motion of a body, from one frame to a later one again and again."""
+
+    def __init__(self) -> None:
+        self._base: BodyFrame | None = None
+        self._since = 0
+        self._rest = 0
+        self._failures = 0
+        self._guess: OwnMotion | None = None
+        self._latest: OwnMotion | None = None
+
+    def update(self, frame: BodyFrame | None) -> OwnMotion | None:
+        """The motion as it was measured last; None where it is not known, or nothing moves (``frame`` is None).
+
+        The first measurement, whose start was searched for, only tells where to look the next time.
+        """
+        if frame is None:
+            self._base = self._guess = self._latest = None
+            self._since = self._rest = self._failures = 0
+            return None
+        base = self._base
+        if base is None or not _are_comparable(base, frame):
+            if base is not None:
+                self._guess = self._latest = None
+            self._rest -= 1
+            if self._rest <= 0:
+                self._base, self._since = _keep(frame), 0
+            return self._latest
+        self._since += 1
+        interval_s = frame.time_s - base.time_s
+        moved_px = frame.px_from_unit @ (frame.drift - base.drift)
+        expected_px = None
+        if self._guess is not None:
+            expected_px = interval_s * (frame.px_from_unit @ self._guess.velocity_m_s)
+            is_near = float(np.hypot(*(expected_px - moved_px))) < _LEAST_APART_PX
+            if is_near and self._since < _MOST_FRAMES:
+                return self._latest
+        elif self._since not in _SEARCHES:
+            return None
+        found = measure_displacement(base, frame, moved_px, expected_px)
+        if found is None and expected_px is None and self._since < _SEARCHES[-1]:
+            # It may be a slow one.
+            return None
+        before, self._guess, self._latest = self._guess, None, None
+        if found is not None:
+            unit_from_px = np.linalg.inv(frame.px_from_unit) / interval_s
+            displacement, covariance = found
+            self._guess = OwnMotion(
+                unit_from_px @ displacement,
+                unit_from_px @ covariance @ unit_from_px.T,
+                base.time_s,
+                frame.time_s,
+            )
+            if before is not None and _is_confirmed(before, self._guess, interval_s, frame):
+                self._latest = self._guess
+        self._failures = self._failures + 1 if found is None else 0
+        self._base, self._rest = None, 0 if self._latest is None else _REST_FRAMES
+        if found is None:
+            self._rest = min(_REST_FRAMES * 2**self._failures, _LONGEST_REST)
+        return self._latest
+
+
+def _is_confirmed(before: OwnMotion, now: OwnMotion, interval_s: float, frame: BodyFrame) -> bool:
+    """Whether two measurements agree, but for what a body may become faster by."""
+    change = now.velocity_m_s - before.velocity_m_s
+    spread = before.covariance + now.covariance
+    distance = float(np.hypot(*(interval_s * (frame.px_from_unit @ change))))
+    return distance < _CHANGE_PX or (
+        float(change @ np.linalg.solve(spread, change)) < _CONFIRMED_SIGMAS**2
+    )
+
+
+def _keep(frame: BodyFrame) -> BodyFrame:
+    """The frame with an image of its own: a driver may use the memory again."""
+    return BodyFrame(
+        np.array(frame.image, copy=True),
+        frame.region,
+        frame.moving,
+        frame.drift.copy(),
+        frame.px_from_unit.copy(),
+        frame.time_s,
+    )
+
+
+def _are_comparable(base: BodyFrame, frame: BodyFrame) -> bool:
+    return (
+        base.image.shape == frame.image.shape
+        and frame.time_s > base.time_s
+        and bool(np.allclose(base.px_from_unit, frame.px_from_unit))
+    )
+
+
+def measure_displacement(
+    before: BodyFrame, now: BodyFrame, moved_px: Array, expected_px: Array | None
+) -> tuple[Array, Array] | None:
+    """Displacement of the largest body between two frames.
+
+    Parameters
+    ----------
+    before, now
+        The frames, of one size and scale.
+    moved_px
+        (2,) by how much the specimen moved.
+    expected_px
+        (2,) by how much the body is expected to have moved; None to search.
+
+    Returns
+    -------
+    (2,) displacement in px and its (2, 2) covariance; None where it is not determined: a body without edges, one that
+    moves as the specimen does or by too little, turns, or changes.
+    """
+    body = _find_body(before)
+    if body is None:
+        return None
+    cut, inside = body
+    left, top, right, bottom = cut
+    reach = _REACH_PX + _MARGIN_PX
+    wide = (
+        max(left - reach, now.region[0]),
+        max(top - reach, now.region[1]),
+        min(right + reach, now.region[2]),
+        min(bottom + reach, now.region[3]),
+    )
+    first, second = _cut(before.image, cut), _cut(now.image, wide)
+    if min(second.shape) < _LEAST_SIDE_PX:
+        return None
+    noise = estimate_noise_variance(to_gray(now.image))
+    smoothed = passed_variance(_SMOOTHED_PX) * noise
+    pair = _Pair(
+        smooth(first, _SMOOTHED_PX),
+        smooth(second, _SMOOTHED_PX),
+        np.subtract(cut[:2], wide[:2]).astype(np.float64),
+    )
+    as_ground = pair.compare(moved_px)
+    evidence = inside & (as_ground > _DISAGREES * 2.0 * smoothed)
+    if np.count_nonzero(evidence) < _LEAST_PIXELS:
+        return None
+    start = pair.search(evidence) if expected_px is None else expected_px
+    level = make_level(Pyramid(first), 1, _SMOOTHED_PX)
+    if level is None or start is None:
+        return None
+    shift, looks, image = start, [], Pyramid(second)
+    mask = evidence
+    for ring in (0, 0, _RING_PX):
+        if not ring:
+            mask = inside & fill_bodies(evidence & (pair.compare(shift) < as_ground), _GAP_PX)
+        found = _align(level, image, grow_mask(mask, ring), shift + pair.offset, smoothed)
+        if found is None:
+            return None
+        looks.append(found)
+        if not ring:
+            shift = found.shift_px - pair.offset
+            if np.max(np.abs(shift - start)) > _BEYOND_PX:
+                return None
+    best = looks[1]
+    by_ring = _PART_OF_RING * (looks[2].shift_px - best.shift_px)
+    covariance = best.covariance + np.diag(by_ring**2 + _FLOOR_PX**2)
+    return (shift, covariance) if _is_body(best, covariance, shift - moved_px, smoothed) else None
+
+
+def _is_body(alignment: Alignment, covariance: Array, apart_px: Array, smoothed: float) -> bool:
+    """Whether what was aligned is one body that moves apart from the specimen."""
+    sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance))))
+    halves = np.abs(alignment.half_difference_px) > _HALF_SIGMAS * np.sqrt(alignment.half_variance)
+    return (
+        sigma <= _MOST_SIGMA_PX
+        and _GAINS[0] < alignment.gain < _GAINS[1]
+        and alignment.residual_rms**2 < _MOST_LEFT * 2.0 * smoothed
+        and not np.any(halves)
+        and float(apart_px @ np.linalg.solve(covariance, apart_px)) > _APART_SIGMAS**2
+    )
+
+
+def _find_body(frame: BodyFrame) -> tuple[Region, Mask] | None:
+    """The part of a frame around its largest body, and which pixels of that part may show it."""
+    tiles = frame.moving.tiles
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(
+        tiles.astype(np.uint8), connectivity=8
+    )
+    if count < 2:
+        return None
+    largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+    col, row, cols, rows = (int(v) for v in statistics[largest][:4])
+    spans = []
+    for axis, begin, length in ((0, col, cols), (1, row, rows)):
+        corner, side = float(frame.moving.corner_px[axis]), float(frame.moving.side_px[axis])
+        low = corner + side * (begin - 1) - _MARGIN_PX
+        high = corner + side * (begin + length + 1) + _MARGIN_PX
+        short = max(0.0, _LEAST_SIDE_PX - (high - low))
+        spans.append(
+            (
+                max(int(np.floor(low - 0.5 * short)), frame.region[axis]),
+                min(int(np.ceil(high + 0.5 * short)), frame.region[axis + 2]),
+            )
+        )
+    (left, right), (top, bottom) = spans
+    if min(right - left, bottom - top) < _LEAST_SIDE_PX:
+        return None
+    only = MovingTiles(labels == largest, frame.moving.corner_px, frame.moving.side_px, 0.0)
+    x, y = np.arange(left, right, dtype=np.float64), np.arange(top, bottom, dtype=np.float64)
+    return (left, top, right, bottom), only.grown().at(x, y)
+
+
+def _cut(image: AnyImage, region: Region) -> Image:
+    left, top, right, bottom = region
+    return np.ascontiguousarray(to_gray(image[top:bottom, left:right]), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two smoothed images, of which the first lies ``offset`` (2,) right and down in the second."""
+
+    first: Image
+    second: Image
+    offset: Array
+
+    def compare(self, shift_px: Array) -> Image:
+        """(h, w) squared difference about each pixel of the first where the second is shifted by so much."""
+        x, y = (self.offset + shift_px).tolist()
+        height, width = self.first.shape
+        there = cv2.warpAffine(
+            self.second,
+            np.array([[1.0, 0.0, x], [0.0, 1.0, y]]),
+            (width, height),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        size = (_SQUARE_PX, _SQUARE_PX)
+        return np.asarray(cv2.boxFilter((there - self.first) ** 2, cv2.CV_32F, size))
+
+    def search(self, mask: Mask) -> Array | None:
+        """(2,) the whole shift, to 2 px, at which the second shows best what the first shows at a mask."""
+        rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        part = slice(rows[0], rows[-1] + 1, 2), slice(cols[0], cols[-1] + 1, 2)
+        template = np.ascontiguousarray(self.first[part])
+        weight = np.ascontiguousarray(mask[part], dtype=np.float32)
+        low = np.array([cols[0], rows[0]]) + self.offset - _REACH_PX
+        size = 2 * np.array(template.shape[::-1]) + 2 * _REACH_PX
+        warp = np.array([[2.0, 0.0, low[0]], [0.0, 2.0, low[1]]])
+        wide = cv2.warpAffine(
+            self.second,
+            warp,
+            (int(size[0]) // 2, int(size[1]) // 2),
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        found = cv2.matchTemplate(wide, template, cv2.TM_SQDIFF, mask=weight)
+        if not np.all(np.isfinite(found)):
+            return None
+        row, col = np.unravel_index(int(np.argmin(found)), found.shape)
+        return 2.0 * np.array([col, row], dtype=np.float64) - _REACH_PX
+
+
+def _align(
+    level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array, smoothed: float
+) -> Alignment | None:
+    """Refine a shift by the pixels of a mask alone."""
+    part = drop_pixels(level, ~mask)
+    counts = np.asarray(part.normal_matrices[..., 3, 3] >= _LEAST_OF_TILE, dtype=np.float64)
+    found = align_reweighted(
+        part,
+        image,
+        start_px,
+        counts,
+        smoothed,
+        lambda tiles: counts[tiles.rows, tiles.cols],
+        looks=False,
+    )
+    return None if isinstance(found, Rejection) or not found.converged else found
