@@ -19,6 +19,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Float64
@@ -115,6 +116,7 @@ def test_a_late_subscriber_gets_the_camera_of_the_newest_frames(
         np.testing.assert_allclose(infos[0].p[0], CAMERA_AFTER.rectified.K[0, 0], rtol=1e-12)
 
 
+@pytest.mark.long
 def test_the_parameter_server_keeps_no_camera_beside_a_node_that_publishes_one_a_frame(
     peer: Peer, calibration_file: Path
 ) -> None:

@@ -83,6 +83,7 @@ def wait_open(peer: Peer) -> None:
     peer.wait_for(lambda: peer.state(NODE).get("source_state") == "open", "the open folder")
 
 
+@pytest.mark.long
 def test_a_picture_comes_with_magnification_stage_and_conditions(
     peer: Peer, settings: dict[str, Any]
 ) -> None:

@@ -67,6 +67,7 @@ def test_a_smooth_microscope_is_not_suspected():
     assert not any("jump" in w for w in smooth.warnings)
 
 
+@pytest.mark.long
 def test_a_breakpoint_gives_the_scale_on_both_sides():
     model = _calibrated(breakpoints=(3000.0,)).model
     for g in (2900.0, 3000.0, 3100.0):

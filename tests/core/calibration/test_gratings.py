@@ -96,6 +96,7 @@ def test_two_directions_leave_the_skew_to_its_prior_and_say_so() -> None:
     assert np.allclose(done.calibration.at(3000.0).pixel_size_m, expected, rtol=2e-3)
 
 
+@pytest.mark.long
 def test_the_advice_is_to_turn_and_its_views_bring_what_it_says() -> None:
     first = [view(3000.0, turn) for turn in (0.1, 0.7, 0.12)]
     done = calibrated(first)

@@ -189,6 +189,7 @@ def test_where_half_of_a_magnification_disagrees_no_single_view_is_at_fault():
     assert not find_outliers(*_adjusted(group, residual))
 
 
+@pytest.mark.long
 def test_a_magnification_of_which_no_view_is_left_is_not_calibrated() -> None:
     """The only view of a magnification was recorded at one that is 6 % off."""
     others = seen_views("jsm820", (300.0, 800.0, 1800.0, 3500.0))
