@@ -73,6 +73,41 @@ class Progress:
         return str(self.messages[-1].message)
 
 
+# Of a command whose output is followed while it runs.
+OPTIONS: dict[str, Any] = {
+    "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+    "text": True,
+}
+
+
+def interrupted(command: list[str], until: str) -> str:
+    """Run a command until it says something that matches, then end it by Ctrl-C; return all that it said."""
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **OPTIONS
+    ) as process:
+        assert process.stdout is not None
+        said = ""
+        while not re.search(until, said, re.MULTILINE):
+            line = process.stdout.readline()
+            assert line, said
+            said += line
+        process.send_signal(signal.SIGINT)
+        said += process.stdout.read()
+    assert process.returncode == 1, said
+    return said
+
+
+def resumed(command: list[str], views: Path, timeout_s: float) -> subprocess.CompletedProcess[str]:
+    """Go on with an acquisition that was interrupted."""
+    return subprocess.run(
+        [*command, "--resume", str(views)],
+        capture_output=True,
+        timeout=timeout_s,
+        check=False,
+        **OPTIONS,
+    )
+
+
 @pytest.mark.long
 def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl_c(
     tmp_path: Path,
@@ -82,35 +117,14 @@ def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl
     command = [sys.executable, "-m", "semcal_ros", "acquire", "-o", str(output)]
     command += ["--config", "virtual_sem", "--microscope", "virtual_sem"]
     command += ["--range", "1500,3000", "--target", "5%", "--tilts", "0,30deg"]
-    options: dict[str, Any] = {
-        "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
-        "text": True,
-    }
     with running("virtual_sem", SEM):
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options
-        ) as first:
-            assert first.stdout is not None
-            said = ""
-            # The first visit, and a part of the second one.
-            while not re.search(r"^3/8: set", said, re.MULTILINE):
-                line = first.stdout.readline()
-                assert line, said
-                said += line
-            first.send_signal(signal.SIGINT)
-            said += first.stdout.read()
-        assert first.returncode == 1, said
+        # The first visit, and a part of the second one.
+        said = interrupted(command, r"^3/8: set")
         views = tmp_path / "cal_views"
         assert f"recorded to {views}" in said.splitlines()[0]
         assert said.splitlines()[-1].endswith(f"--resume {views} goes on")
         assert not output.exists()
-        done = subprocess.run(
-            [*command, "--resume", str(views)],
-            capture_output=True,
-            timeout=150.0,
-            check=False,
-            **options,
-        )
+        done = resumed(command, views, timeout_s=150.0)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr == ""
     lines = done.stdout.splitlines()
@@ -150,34 +164,13 @@ def test_semcal_acquire_extends_a_calibration_and_goes_on_after_ctrl_c(tmp_path:
     command = [sys.executable, "-m", "semcal_ros", "acquire", "-o", str(output)]
     command += ["--config", "virtual_sem", "--microscope", "virtual_sem"]
     command += ["--extend", str(grid), "--to", "14000x"]
-    options: dict[str, Any] = {
-        "env": {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
-        "text": True,
-    }
     with running("virtual_sem", {**SEM, "specimen": "gold", "drift": "slow"}):
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options
-        ) as first:
-            assert first.stdout is not None
-            said = ""
-            # The first magnification, and a part of the second one.
-            while not re.search(r"^5/16: ", said, re.MULTILINE):
-                line = first.stdout.readline()
-                assert line, said
-                said += line
-            first.send_signal(signal.SIGINT)
-            said += first.stdout.read()
-        assert first.returncode == 1, said
+        # The first magnification, and a part of the second one.
+        said = interrupted(command, r"^5/16: ")
         assert said.splitlines()[0].startswith(f"ladder begun, recorded to {views}")
         assert re.search(rf"ended with [56] pictures; .* --resume {views} goes on$", said.rstrip())
         assert not output.exists()
-        done = subprocess.run(
-            [*command, "--resume", str(views)],
-            capture_output=True,
-            timeout=200.0,
-            check=False,
-            **options,
-        )
+        done = resumed(command, views, timeout_s=200.0)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
     assert re.fullmatch(rf"[56]/16: [56] pictures taken over from {views}", lines[1])
