@@ -27,6 +27,7 @@ followed by the distortion of the lens (:mod:`semcal_ros.core.camera.distortion`
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +61,12 @@ CAMERA_SIZES: tuple[int, ...] = tuple(
     ALL_NAMES.index(last) + 1 for last in ("ey", "xi_u", SCAN_NAMES[-1])
 )
 """How many of :data:`ALL_NAMES` a camera may have: the first ones, those of the lens, or all. Fewer are faster."""
+
+
+def camera_size(names: Collection[str]) -> int:
+    """Return the smallest of :data:`CAMERA_SIZES` whose cameras have parameters of these names."""
+    last = max(ALL_NAMES.index(name) for name in names)
+    return next(size for size in CAMERA_SIZES if size > last)
 
 
 @dataclass(frozen=True)

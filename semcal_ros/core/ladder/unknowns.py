@@ -49,7 +49,7 @@ from semcal_ros.core.camera.calibration_model import (
     names_of,
 )
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.projection import ALL_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES, camera_size
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = [
@@ -146,8 +146,8 @@ class LadderSetup:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters of the camera that functions give."""
-        return ALL_NAMES if len(self.functions) > 10 else ALL_NAMES[:10]
+        """The parameters of the camera, as many as the functions need."""
+        return ALL_NAMES[: camera_size(self.functions.keys() & set(ALL_NAMES))]
 
     @cached_property
     def coefficients(self) -> Array:

@@ -39,7 +39,7 @@ from semcal_ros.core.arrays import Array, Indices, Mask
 from semcal_ros.core.calibration.stage import OFFSET_NAMES, Attitudes
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
-from semcal_ros.core.camera.projection import ALL_NAMES, CAMERA_SIZES, PARAMETER_NAMES
+from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES, camera_size
 from semcal_ros.core.camera.scan_distortion import Raster
 from semcal_ros.core.errors import CalibrationError
 
@@ -317,8 +317,7 @@ class Problem:
         own = self.designs[:, : len(self.parameters)] @ theta
         if self.parameters == PARAMETER_NAMES:
             return own
-        size = next(size for size in CAMERA_SIZES if size > self.parameter_index.max())
-        out = np.zeros((len(self.designs), size))
+        out = np.zeros((len(self.designs), camera_size(self.parameters)))
         out[:, self.parameter_index] = own
         return out
 
