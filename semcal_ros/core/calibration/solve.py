@@ -33,6 +33,7 @@ from semcal_ros.core.calibration.estimator.posterior import (
     CovarianceParts,
     LineJitter,
     estimate_jitter,
+    linearise_padded,
     pad_covariance,
     pad_functions,
     pattern_covariance,
@@ -204,10 +205,11 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     on_stage("uncertainty", 0.9)
     padded = pad_functions(adjustment.functions)
     jitter = estimate_jitter(adjustment.problem, adjustment.result)
-    covariance = pad_covariance(setup, padded, adjustment, field, jitter)
+    problem, result = linearise_padded(final, padded, adjustment)
+    covariance = pad_covariance(setup, problem, result, adjustment, field, jitter)
     if selection.pattern is not None:
-        covariance = covariance + pattern_covariance(setup, padded, adjustment, selection.pattern)
-    parts = split_covariance(setup, padded, adjustment, final.views, jitter)
+        covariance = covariance + pattern_covariance(setup, problem, result, selection.pattern)
+    parts = split_covariance(padded, problem, result, adjustment, jitter)
     return JointFit(
         adjustment,
         padded,

@@ -22,7 +22,7 @@ the residuals between lines, which is estimated from their products.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,10 +56,8 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     field_system,
     held_prior,
     solve_field,
-    undo_field,
 )
 from semcal_ros.core.calibration.estimator.residuals import corner_rows
-from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.fit_record import Certificate
@@ -72,6 +70,7 @@ __all__ = [
     "estimate_changes",
     "estimate_jitter",
     "jitter_covariance",
+    "linearise_padded",
     "pad_covariance",
     "pad_functions",
     "pattern_covariance",
@@ -330,11 +329,14 @@ def pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
     return out
 
 
-def _linearise(
-    setup: Setup, padded: Functions, views: Sequence[GridView], adjustment: Adjustment
+def linearise_padded(
+    setup: Setup, padded: Functions, adjustment: Adjustment
 ) -> tuple[Problem, BundleResult]:
-    """Return the problem of the padded functions, and its equations at the adjusted solution."""
-    problem = build_problem(setup, padded, views, adjustment.spread)
+    """Return the problem of the padded functions, and its equations at the adjusted solution.
+
+    The views of ``setup`` are those of the adjustment, from which a residual field has been taken off.
+    """
+    problem = build_problem(setup, padded, setup.views, adjustment.spread)
     state = adjustment.result.state
     state = replace(state, theta=stack_theta(setup, padded, state))
     result = refine(problem, state, max_iterations=0)
@@ -371,20 +373,20 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
 
 def pad_covariance(
     setup: Setup,
-    padded: Functions,
+    problem: Problem,
+    result: BundleResult,
     adjustment: Adjustment,
     field: FittedField | None,
     jitter: LineJitter,
 ) -> Array:
     """Return the covariance of the coefficients of the padded functions and of the field.
 
+    ``problem`` and ``result`` are those of :func:`linearise_padded`, and ``setup`` has the views as they were observed.
     A coefficient that was left out is not known to be zero: where the data do not determine it, its
     prior gives its uncertainty. Nor do the data say that it is zero: the estimate may also be wrong
     by as much as all coefficients would move if the omitted ones were free. Residuals that are
     smaller than the corners say do not make it smaller; those that lines share make it larger.
     """
-    views = setup.views if field is None else undo_field(setup, field.field).views
-    problem, result = _linearise(setup, padded, views, adjustment)
     state = result.state
     factor = variance_factor(adjustment.problem, adjustment.result)
     size = len(state.theta) - len(setup.shared)
@@ -408,20 +410,20 @@ def pad_covariance(
 
 
 def split_covariance(
-    setup: Setup,
     padded: Functions,
+    problem: Problem,
+    result: BundleResult,
     adjustment: Adjustment,
-    views: Sequence[GridView],
     jitter: LineJitter,
 ) -> CovarianceParts:
     """Split the covariance C of the padded functions into what corners, visits and left-out coefficients add.
 
+    ``problem`` and ``result`` are those of :func:`linearise_padded`.
     The information is that of the corners and that of the priors, C^-1 = N + P, so that C = C N C + C P C: the first
     is what errors of the corners do to the estimate, the second what the priors stand for does. With all corners
     ``1 + t`` times as certain, C is ``((1 + t)^2 N + P)^-1``, whose derivative at t = 0 is -2 C N C. The
     prior of the coefficients that were left out is diagonal.
     """
-    problem, result = _linearise(setup, padded, views, adjustment)
     state = result.state
 
     def covariance(certainty: float) -> Array:
@@ -435,7 +437,7 @@ def split_covariance(
     left = _left_out(adjustment.functions, padded)
     omitted = (whole[:, left] / problem.prior_sigma[left] ** 2) @ whole[left]
     factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
-    size = len(state.theta) - len(setup.shared)
+    size = len(state.theta) - len(problem.shared)
     own = slice(0, size)
     shaken = jitter_covariance(problem, result, jitter)
     return CovarianceParts(
@@ -455,13 +457,13 @@ def _left_out(chosen: Functions, padded: Functions) -> Indices:
 
 
 def pattern_covariance(
-    setup: Setup, padded: Functions, adjustment: Adjustment, pattern: GridPattern
+    setup: Setup, problem: Problem, result: BundleResult, pattern: GridPattern
 ) -> Array:
     """Return what an irregular grid adds to the covariance of the coefficients.
 
-    It is the difference between the covariances with the pattern unknown and with none.
+    It is the difference between the covariances with the pattern unknown and with none. ``problem`` and ``result`` are
+    those of :func:`linearise_padded`.
     """
-    problem, result = _linearise(setup, padded, setup.views, adjustment)
     blank = blank_field(setup)
     system = field_system(setup, problem, result, blank, of_grid=True)
     size = len(result.state.theta) - len(setup.shared)
