@@ -29,7 +29,6 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
 )
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import (
-    COARSE,
     right_way_up,
     try_other_poses,
 )
@@ -74,6 +73,9 @@ __all__ = ["JointFit", "solve", "without_magnification"]
 # Updates of the variance components at most, until they change by less than the last number: a mirrored recording then
 # gives the mirrored camera to a millionth of a sigma.
 _LAST_UPDATES, _SMALL_CHANGE = 40, 1e-6
+# What an adjustment between two updates may leave, relative to the cost and in half chi-squares: with more, the updates
+# go to and fro instead of ending.
+_NEAR, _PREDICTED = 1e-9, 1e-6
 # Of the last adjustment, relative to the cost and in half chi-squares. It starts undamped: a damped first step along
 # what is hardly determined is so short that it would pass for the last.
 _EXACT, _MOST_ITERATIONS = 1e-10, 300
@@ -142,7 +144,9 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     updates: list[tuple[VarianceComponents, VarianceComponents]] = []
     while len(updates) < _LAST_UPDATES:
         problem = build_problem(setup, functions, setup.views, spread)
-        result = refine(problem, state, tolerance=COARSE, first_damping=MIN_DAMPING)
+        result = refine(
+            problem, state, tolerance=_NEAR, predicted=_PREDICTED, first_damping=MIN_DAMPING
+        )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
         updates.append((spread, update_components(setup, problem, result)))
