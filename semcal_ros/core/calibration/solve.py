@@ -35,10 +35,8 @@ from semcal_ros.core.calibration.estimator.poses import (
 from semcal_ros.core.calibration.estimator.posterior import (
     CovarianceParts,
     LineJitter,
-    estimate_jitter,
-    linearise_padded,
+    pad,
     pad_covariance,
-    pad_functions,
     pattern_covariance,
     split_covariance,
 )
@@ -215,20 +213,17 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
     on_stage("uncertainty", 0.9)
-    padded = pad_functions(adjustment.functions)
-    jitter = estimate_jitter(adjustment.problem, adjustment.result)
-    problem, result = linearise_padded(final, padded, adjustment)
-    covariance = pad_covariance(setup, problem, result, adjustment, field, jitter)
+    padded = pad(final, adjustment)
+    covariance = pad_covariance(setup, padded, field)
     if selection.pattern is not None:
-        covariance = covariance + pattern_covariance(setup, problem, result, selection.pattern)
-    parts = split_covariance(padded, problem, result, adjustment, jitter)
+        covariance = covariance + pattern_covariance(setup, padded, selection.pattern)
     return JointFit(
         adjustment,
-        padded,
+        padded.functions,
         covariance,
-        jitter,
+        padded.jitter,
         field,
         selection.pattern,
         selection.excess_px,
-        parts,
+        split_covariance(padded),
     )
