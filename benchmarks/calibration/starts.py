@@ -122,7 +122,9 @@ def end_of(setup: Setup, started: Start) -> End:
     fit = solve(select(started, "off"), lambda _name, _fraction: None)
     own = fit.adjustment
     size = sum(function.size for function in own.functions.values())
-    return End(own.result.cost, size, make_model(setup, fit.padded, fit.covariance, "joint"))
+    return End(
+        own.result.cost, size, make_model(setup, fit.padded.functions, fit.covariance, "joint")
+    )
 
 
 def largest_sigmas(model: CalibrationModel, other: CalibrationModel) -> float:

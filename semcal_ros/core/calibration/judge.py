@@ -96,7 +96,7 @@ def describe_stage(setup: Setup, fit: JointFit) -> dict[str, Any]:
         "visit_height_sigma_m": spread.visit_height.sigma,
         "drift_sigma_px": [float(spread.drift_sigma_px.min()), float(spread.drift_sigma_px.max())],
         "lattice_sigma": None if spread.lattice_sigma is None else spread.lattice_sigma.tolist(),
-        "line_jitter_px": fit.jitter.sigma_px,
+        "line_jitter_px": fit.padded.jitter.sigma_px,
     }
 
 
@@ -242,7 +242,7 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
                 magnification=excess_at,
             )
         )
-    change = find_change_point(setup, adjustment.problem, result)
+    change = find_change_point(setup, fit.padded.problem, fit.padded.result)
     if change is not None:
         findings.append(
             Finding(
@@ -269,7 +269,7 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
         **describe_stage(setup, fit),
     }
     return MethodFit(
-        fit.padded,
+        fit.padded.functions,
         fit.covariance,
         lambda index: without_magnification(fit, index),
         adjustment.problem.height_sigma_m,

@@ -34,7 +34,7 @@ from semcal_ros.core.calibration.estimator.poses import (
 )
 from semcal_ros.core.calibration.estimator.posterior import (
     CovarianceParts,
-    LineJitter,
+    PaddedAdjustment,
     pad,
     pad_covariance,
     pattern_covariance,
@@ -89,11 +89,10 @@ class JointFit:
     ----------
     adjustment
         The adjustment with the chosen number of coefficients.
-    padded, covariance
-        The same functions with a few more coefficients, which are zero, and the covariance of all
-        of them, followed by that of the coefficients of the field.
-    jitter
-        Errors that corners on neighbouring lines share.
+    padded
+        The same with a few more coefficients, which are zero.
+    covariance
+        Covariance of the coefficients of the padded functions, followed by that of the coefficients of the field.
     field
         The residual field, or None.
     pattern
@@ -105,9 +104,8 @@ class JointFit:
     """
 
     adjustment: Adjustment
-    padded: Functions
+    padded: PaddedAdjustment
     covariance: Array
-    jitter: LineJitter
     field: FittedField | None
     pattern: GridPattern | None
     excess_px: float
@@ -219,9 +217,8 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         covariance = covariance + pattern_covariance(setup, padded, selection.pattern)
     return JointFit(
         adjustment,
-        padded.functions,
+        padded,
         covariance,
-        padded.jitter,
         field,
         selection.pattern,
         selection.excess_px,

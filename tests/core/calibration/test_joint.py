@@ -60,10 +60,10 @@ def fit(setup: Setup) -> JointFit:
 
 def _padded(setup: Setup, fit: JointFit) -> tuple[Problem, State]:
     """The adjustment of the padded functions, whose changes are as large as they seem to be, and the end of the fit."""
-    problem = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
-    state = replace(fit.adjustment.result.state, theta=stack_coefficients(fit.padded))
+    problem = build_problem(setup, fit.padded.functions, setup.views, fit.adjustment.spread)
+    state = replace(fit.adjustment.result.state, theta=stack_coefficients(fit.padded.functions))
     result = refine(problem, state, max_iterations=0)
-    sigma = estimate_changes(fit.padded, problem, result)
+    sigma = estimate_changes(fit.padded.functions, problem, result)
     return replace(problem, prior_sigma=sigma), state
 
 
@@ -71,7 +71,7 @@ def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_
     setup: Setup, fit: JointFit
 ) -> None:
     adjustment = fit.adjustment
-    start = stack_coefficients(fit.padded)
+    start = stack_coefficients(fit.padded.functions)
     problem, state = _padded(setup, fit)
     freed = refine(problem, state)
     factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
@@ -91,7 +91,9 @@ def test_the_part_of_the_corners_is_what_their_noise_does_and_the_parts_fit_in(
     """A tenth of the stated noise is added to the corners, and the scale scatters by that part of its sigma."""
     problem, start = _padded(setup, fit)
     sigma_px = np.concatenate([view.sigma_px for view in setup.views])[:, None]
-    rows = np.stack([design_matrix(fit.padded, g, 1.0)[0] for g in (150.0, 700.0, 3000.0, 8000.0)])
+    rows = np.stack(
+        [design_matrix(fit.padded.functions, g, 1.0)[0] for g in (150.0, 700.0, 3000.0, 8000.0)]
+    )
     rng = np.random.default_rng(0)
 
     def scale(noise_px: np.ndarray) -> np.ndarray:
@@ -170,10 +172,10 @@ def test_magnifications_that_agree_make_the_prior_of_changes_about_half_as_wide(
     known = np.array([500.0, 1000.0, 2000.0])
     setup = Setup(tuple(views), known, JSM.image_size, JSM.display_width_m, Priors())
     fit = fit_joint(setup)
-    usual = build_problem(setup, fit.padded, setup.views, fit.adjustment.spread)
+    usual = build_problem(setup, fit.padded.functions, setup.views, fit.adjustment.spread)
     ratios = _padded(setup, fit)[0].prior_sigma / usual.prior_sigma
     start = 0
-    for name, function in fit.padded.items():
+    for name, function in fit.padded.functions.items():
         own = ratios[start : start + function.size]
         start += function.size
         # The constants, and what has no changes, keep their prior.

@@ -77,8 +77,8 @@ class ChangePoint:
 def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> ChangePoint | None:
     """Find the jump that would improve an adjustment most, or None if none is significant.
 
-    ``problem`` and ``result`` are the adjustment at its optimum. Breakpoints that it already has
-    are left out.
+    ``problem`` and ``result`` are the adjustment at its optimum, with coefficients beyond those that were chosen: what
+    a smooth function may do besides is no jump. Breakpoints that it already has are left out.
     """
     if problem.effects is not None:
         # A jump that is not in the model makes the visits look as if they did not come back.
