@@ -191,14 +191,12 @@ class CalibrationServer(StreamNode):
         self._overlay = self.endpoints.stream_publisher(Image, "~/overlay")
         stream = MutuallyExclusiveCallbackGroup()
         # Before the images, as the magnification.
-        self._position = StageInput(self.config.stage, self.endpoints, self.reporter, stream)
-        self._known = ConditionsInput(self.endpoints, self.reporter, group=stream)
+        self._position = StageInput(self.node_context, stream)
+        self._known = ConditionsInput(self.node_context, group=stream)
         self.receive_frames(self._on_frame, group=stream)
         name = self.parameters["microscope"]
         self._commands = (
-            MicroscopeCommands(self, self.endpoints, name, self.config.stage, self._still_acquiring)
-            if name
-            else None
+            MicroscopeCommands(self.node_context, name, self._still_acquiring) if name else None
         )
         quick, compared = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
         handlers = (

@@ -43,13 +43,11 @@ class DriftCompensator(StreamNode):
         self._rectifier = Rectifier(self.parameters["interpolation"])
         self.parameters.on_change("interpolation", self._set_interpolation)
         # Closed in the reverse order, so that the last compressed image is published.
-        self._images = ImageOutput(
-            self.parameters, self.endpoints, self.reporter, "image_stabilized"
-        )
+        self._images = ImageOutput(self.node_context, "image_stabilized")
         self.closing.callback(self._images.close)
-        self._drift = LiveDrift(self.config, self.parameters, self.endpoints, self.reporter)
+        self._drift = LiveDrift(self.node_context)
         self.closing.callback(self._drift.close)
-        self._drifts = DriftOutput(self.endpoints, self.reporter)
+        self._drifts = DriftOutput(self.node_context)
         self.receive_frames(self._on_frame)
 
     def _set_interpolation(self, value: str) -> None:

@@ -96,31 +96,19 @@ class ParameterServer(SemNode):
         self._covariance = self.endpoints.latched_publisher(
             Float64MultiArray, "projection_covariance"
         )
-        self._frames = StaticFramesOutput(self.config, self.endpoints, self.get_clock())
-        self._calibration = CalibrationInput(
-            self.config,
-            self.parameters,
-            self.endpoints,
-            self.reporter,
-            on_change=self._on_calibration,
-        )
-        self._watch = ConditionsWatch(
-            self.endpoints, self.reporter, lambda: self._calibration.current
-        )
+        self._frames = StaticFramesOutput(self.node_context)
+        self._calibration = CalibrationInput(self.node_context, on_change=self._on_calibration)
+        self._watch = ConditionsWatch(self.node_context, lambda: self._calibration.current)
         for setting in _SIZE:
             self.parameters.on_change(setting.name, lambda _value: self._refresh())
-        self._magnification = MagnificationInput(
-            self.config, self.endpoints, self.reporter, self._on_reading
-        )
+        self._magnification = MagnificationInput(self.node_context, self._on_reading)
         self._monitor: CalibrationMonitor | None = None
         if self.parameters[_MONITOR_PERIOD.name] > 0.0:
             # What finds grids and checks calibrations is twice as large as the rest of the node.
             from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
 
             self._monitor = CalibrationMonitor(
-                self.config,
-                self.endpoints,
-                self.reporter,
+                self.node_context,
                 self._magnification,
                 lambda: (self._calibration.current, self._calibration.config),
                 self.parameters[_MONITOR_PERIOD.name],

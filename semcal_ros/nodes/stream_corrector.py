@@ -35,9 +35,9 @@ class StreamCorrector(CalibratedStreamNode):
 
     def __init__(self) -> None:
         super().__init__("stream_corrector", DRIFT_PARAMETERS)
-        self._drift = LiveDrift(self.config, self.parameters, self.endpoints, self.reporter)
+        self._drift = LiveDrift(self.node_context)
         self.closing.callback(self._drift.close)
-        self._drifts = DriftOutput(self.endpoints, self.reporter)
+        self._drifts = DriftOutput(self.node_context)
         self.receive_frames(self._on_frame)
 
     def on_calibration(self) -> None:

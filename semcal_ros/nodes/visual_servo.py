@@ -100,12 +100,9 @@ class VisualServo(SemNode):
         self._reset = None
         if values["reset_service"] and values["goal_frame"] == "instrument":
             self._reset = self.create_client(Trigger, values["reset_service"])
-        self._magnification = MagnificationInput(
-            self.config, self.endpoints, self.reporter, self._on_magnification
-        )
+        self._magnification = MagnificationInput(self.node_context, self._on_magnification)
         self._input = ServoInput(
-            self.endpoints,
-            self.reporter,
+            self.node_context,
             self._on_frame,
             self._halt,
             with_drift=bool(values["with_drift"]),

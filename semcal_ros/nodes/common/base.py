@@ -39,6 +39,7 @@ from semcal_ros.bridge.diagnostics import (
 from semcal_ros.config.config import load_config
 from semcal_ros.core.wording import nearest_name
 from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import (
@@ -73,6 +74,8 @@ class SemNode(Node):
     parameters, endpoints, reporter
         The values of the parameters; the factory of publishers, subscriptions and services; the counters and
         the log.
+    node_context
+        All of these, for inputs and outputs that are objects of their own.
     closing
         What to close before the node is destroyed, in reverse order. A node whose constructor failed is destroyed
         too, and closes what it had opened.
@@ -96,6 +99,9 @@ class SemNode(Node):
         self.config = load_config(self.parameters["config"])
         self.endpoints = Endpoints(self)
         self.reporter = Reporter(self.get_logger(), self.get_clock())
+        self.node_context = NodeContext(
+            self, self.config, self.parameters, self.endpoints, self.reporter
+        )
         if unused and not command_line().of_several:
             self.reporter.warn(f"not parameters of this node, and ignored: {', '.join(unused)}")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)

@@ -77,20 +77,12 @@ class CalibratedStreamNode(StreamNode):
         )
         self.rectifier = Rectifier(self.parameters["interpolation"])
         self.parameters.on_change("interpolation", self._set_interpolation)
-        self.calibration = CalibrationInput(
-            self.config,
-            self.parameters,
-            self.endpoints,
-            self.reporter,
-            on_change=self.on_calibration,
-        )
-        self.output = RectifiedOutput(self.config, self.parameters, self.endpoints, self.reporter)
+        self.calibration = CalibrationInput(self.node_context, on_change=self.on_calibration)
+        self.output = RectifiedOutput(self.node_context)
         # After the last compressed image.
         self.closing.callback(self.output.close)
         self._range = RangeWatch(self.reporter)
-        self._watch = ConditionsWatch(
-            self.endpoints, self.reporter, lambda: self.calibration.current
-        )
+        self._watch = ConditionsWatch(self.node_context, lambda: self.calibration.current)
         self._dropped = 0
         self._refused = 0
         # Only the latest: most frames have the magnification of the frame before.

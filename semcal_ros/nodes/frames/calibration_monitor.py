@@ -37,10 +37,10 @@ from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection, SemcalError
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import glimpse_input
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.workflows.check_and_update import check_found
@@ -91,10 +91,8 @@ class CalibrationMonitor:
 
     Parameters
     ----------
-    config
-        Topic and type of the images.
-    endpoints, reporter
-        Where to subscribe, the log and the values of the diagnostics.
+    context
+        Of the node.
     magnification
         Tells at which magnification a frame was taken.
     calibration
@@ -105,15 +103,14 @@ class CalibrationMonitor:
 
     def __init__(
         self,
-        config: MicroscopeConfig,
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         magnification: MagnificationInput,
         calibration: Callable[[], tuple[Calibration | None, MicroscopeConfig]],
         period_s: float,
     ) -> None:
-        self._databar = DatabarCutter(config.image.databar_rows)
-        self._reporter = reporter
+        image = context.config.image
+        self._databar = DatabarCutter(image.databar_rows)
+        self._reporter = context.reporter
         self._magnification = magnification
         self._calibration = calibration
         self._period_s = period_s
@@ -121,10 +118,10 @@ class CalibrationMonitor:
         self._number = 0
         self._bad: list[str] = []
         self._reported: tuple[Calibration | None, bool] = (None, False)
-        self._worker = LatestWorker(endpoints.guard, _examine, self._on_seen)
-        self._type = message_class(config.image.type)
-        self._subscription = endpoints.subscribe(
-            self._type, config.image.topic, self._on_bytes, glimpse_input(), raw=True
+        self._worker = LatestWorker(context.endpoints.guard, _examine, self._on_seen)
+        self._type = message_class(image.type)
+        self._subscription = context.endpoints.subscribe(
+            self._type, image.topic, self._on_bytes, glimpse_input(), raw=True
         )
 
     def _on_bytes(self, data: bytes, info: MessageInfo) -> None:

@@ -23,16 +23,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import bin_image
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.reference import RegistrationSettings
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.frames.load_monitor import LoadMonitor
 from semcal_ros.nodes.frames.stream import StreamFrame
 from semcal_ros.nodes.workers.child_process import ChildProcessEnded
@@ -123,35 +122,25 @@ class LiveDrift:
 
     Parameters
     ----------
-    config
-        What the stamps mean, and the raster timing.
-    parameters
-        Parameters among which are :data:`DRIFT_PARAMETERS`.
-    endpoints, reporter
-        Where to serve ``~/reset``, and the counters and the log.
+    context
+        Of the node; among its parameters are :data:`DRIFT_PARAMETERS`.
 
     Notes
     -----
     :meth:`close` must be called before the node is destroyed.
     """
 
-    def __init__(
-        self,
-        config: MicroscopeConfig,
-        parameters: Parameters,
-        endpoints: Endpoints,
-        reporter: Reporter,
-    ) -> None:
-        self._config = config
-        self._parameters = parameters
-        self._reporter = reporter
+    def __init__(self, context: NodeContext) -> None:
+        self._config = context.config
+        self._parameters = context.parameters
+        self._reporter = context.reporter
         self._load = LoadMonitor()
         self._failed = 0
         self._process = DriftProcess()
         for setting in (*_RESTARTING, _DETAIL):
-            parameters.on_change(setting.name, lambda _value: self.reset())
+            self._parameters.on_change(setting.name, lambda _value: self.reset())
         self.reset()
-        self._service = endpoints.trigger_service("~/reset", self._on_reset)
+        self._service = context.endpoints.trigger_service("~/reset", self._on_reset)
 
     def _on_reset(self) -> str:
         self.reset()

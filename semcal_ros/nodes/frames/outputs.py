@@ -35,11 +35,8 @@ from semcal_ros.bridge.drift import (
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import fill_image, pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import Parameters
-from semcal_ros.nodes.common.reporter import Reporter
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.frames.compressed import CompressedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame
 
@@ -63,13 +60,11 @@ class ImageOutput:
         Whether it is; not where the pixels are handed over to others of this process.
     """
 
-    def __init__(
-        self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter, topic: str
-    ) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext, topic: str) -> None:
+        self._reporter = context.reporter
         self._message = Image()
-        self._publisher = endpoints.stream_publisher(Image, topic)
-        self._compressed = CompressedOutput(parameters, endpoints, reporter, topic)
+        self._publisher = context.endpoints.stream_publisher(Image, topic)
+        self._compressed = CompressedOutput(context, topic)
         self.pixels: NDArray[Any] = np.empty(0)
         self.reuses_memory = True
 
@@ -123,26 +118,19 @@ class RectifiedOutput:
 
     Parameters
     ----------
-    config
-        Where the raw images come from.
-    parameters, endpoints, reporter
-        As for :class:`ImageOutput`.
+    context
+        Of the node.
     """
 
-    def __init__(
-        self,
-        config: MicroscopeConfig,
-        parameters: Parameters,
-        endpoints: Endpoints,
-        reporter: Reporter,
-    ) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext) -> None:
+        endpoints = context.endpoints
+        self._reporter = context.reporter
         self._databar_rows = 0
-        self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
+        self._image = ImageOutput(context, "image_rect")
         sibling, below = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
         matrix = "projection_stamped"
         covariance = "projection_covariance_stamped"
-        raw = config.image.topic
+        raw = context.config.image.topic
         info = _CameraOutput(CameraInfo(), fill_camera_info)
         projection = _CameraOutput(Image(), fill_stamped_projection)
         spread = _CameraOutput(Image(), fill_stamped_projection_covariance)
@@ -219,8 +207,9 @@ class RectifiedOutput:
 class DriftOutput:
     """Publishes ``drift``, ``drift_velocity`` and ``~/moving``, and notes the state of the tracking."""
 
-    def __init__(self, endpoints: Endpoints, reporter: Reporter) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext) -> None:
+        endpoints = context.endpoints
+        self._reporter = context.reporter
         self._drift = endpoints.stream_publisher(PoseWithCovarianceStamped, "drift")
         self._velocity = endpoints.stream_publisher(TwistWithCovarianceStamped, "drift_velocity")
         self._moving = endpoints.stream_publisher(Image, "~/moving")

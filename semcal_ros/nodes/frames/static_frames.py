@@ -19,14 +19,12 @@ from __future__ import annotations
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
-from rclpy.clock import Clock
 
 from semcal_ros.bridge.static_frames import StaticFrame, fill_static_frames, static_frames
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 
 __all__ = ["StaticFramesOutput"]
 
@@ -36,15 +34,13 @@ class StaticFramesOutput:
 
     Parameters
     ----------
-    config
-        Names the frame of the images, and says how the stage is turned.
-    endpoints, clock
-        Of the node.
+    context
+        Of the node; its configuration names the frame of the images, and says how the stage is turned.
     """
 
-    def __init__(self, config: MicroscopeConfig, endpoints: Endpoints, clock: Clock) -> None:
-        self._config = config
-        self._clock = clock
+    def __init__(self, context: NodeContext) -> None:
+        self._config = context.config
+        self._clock = context.node.get_clock()
         self._published: tuple[StaticFrame, ...] = ()
         self._new_message: Any = None
         try:
@@ -52,7 +48,7 @@ class StaticFramesOutput:
         except ConfigError:
             # tf2 is not on PyPI, and who has no tf2 needs no frames.
             return
-        self._publisher = endpoints.latched_publisher(self._new_message, "/tf_static")
+        self._publisher = context.endpoints.latched_publisher(self._new_message, "/tf_static")
         self.publish(None)
 
     def publish(self, camera: ScanCamera | None) -> None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -39,10 +39,10 @@ from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import image_input
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.frames.source_timestamps import SourceTimestamps
@@ -148,44 +148,42 @@ class FrameInput:
 
     Parameters
     ----------
-    config
-        Topics of images and magnifications, and what they mean.
-    parameters
-        Parameters among which is ``mixed_frames``.
-    endpoints, reporter
-        Where to subscribe, and the counters and the log.
+    context
+        Of the node; among its parameters is ``mixed_frames`` unless ``keep_mixed`` is set.
     on_frame
         Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted.
     magnification_config
-        Returns the configuration with which magnifications are read; by default ``config``.
+        Returns the configuration with which magnifications are read; by default that of the node.
     topic, databar_rows
         Topic of the images if they are derived from the microscope's, and the number of text rows at their bottom;
         by default those of the configuration, which may be to find them in the first two images.
     group
         Callback group of both subscriptions.
+    keep_mixed
+        Hand on frames that were being scanned while the magnification changed, whatever the parameter says.
     """
 
     def __init__(
         self,
-        config: MicroscopeConfig,
-        parameters: Parameters | Mapping[str, Any],
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         on_frame: Callable[[StreamFrame], None],
         *,
         magnification_config: Callable[[], MicroscopeConfig] | None = None,
         topic: str | None = None,
         databar_rows: int | None = None,
         group: CallbackGroup | None = None,
+        keep_mixed: bool = False,
     ) -> None:
+        config, endpoints = context.config, context.endpoints
         source = config.image
-        self._parameters = parameters
-        self._reporter = reporter
+        self._parameters = context.parameters
+        self._reporter = context.reporter
+        self._keep_mixed = keep_mixed
         self._on_frame = on_frame
         self._magnification_config = magnification_config or (lambda: config)
         self._databar = DatabarCutter(source.databar_rows if databar_rows is None else databar_rows)
         # Before the images, so that a late-joining node knows the magnification of its first frame.
-        self._magnification = MagnificationInput(config, endpoints, reporter, group=group)
+        self._magnification = MagnificationInput(context, group=group)
         # Images that another node of the suite derives from the microscope's are not compressed.
         kind = message_class(IMAGE_TYPE if topic else source.type)
         self._source = SourceTimestamps(endpoints, source if topic else None)
@@ -259,11 +257,14 @@ class FrameInput:
         interval_s = self._interval_s(published_ns(info), missed)
         try:
             frame = self._frame(message, info, interval_s)
-            if frame and not (frame.mixed and self._parameters[_MIXED.name] == "drop"):
+            if frame and (not frame.mixed or self._takes_mixed()):
                 self._on_frame(frame)
         except NODE_ERRORS as error:
             self._reporter.reject(error)
         self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))
+
+    def _takes_mixed(self) -> bool:
+        return self._keep_mixed or self._parameters[_MIXED.name] != "drop"
 
     def _interval_s(self, sent_ns: int, missed: int) -> float | None:
         before, self._sent_ns = self._sent_ns, sent_ns
@@ -379,9 +380,7 @@ class StreamNode(SemNode):
 
     def receive_frames(self, on_frame: Callable[[StreamFrame], None], **options: Any) -> None:
         """Start receiving frames, at the end of the constructor; ``options`` are those of :class:`FrameInput`."""
-        self.frames = FrameInput(
-            self.config, self.parameters, self.endpoints, self.reporter, on_frame, **options
-        )
+        self.frames = FrameInput(self.node_context, on_frame, **options)
 
     def known_magnification(self, frame: StreamFrame) -> float | None:
         """Return the magnification of a frame; count a frame without one."""
