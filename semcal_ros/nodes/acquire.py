@@ -75,8 +75,7 @@ class _Acquirer(CalibrationServer):
         if self.acquisition_progress.state == "done":
             self._say(f"all pictures: {self.recording}")
         elif self.recording.exists():
-            unit = "view" if self._acquisition is None else self._acquisition.unit
-            views = counted(self.acquisition_progress.views, unit)
+            views = counted(self.acquisition_progress.views, self.acquisition_unit)
             self._say(
                 f"ended with {views}; the same command with --resume {self.recording} goes on"
             )

@@ -19,10 +19,9 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,11 +39,8 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.acquisition import (
     AcquisitionGoal,
     ViewRequest,
-    find_picture_fault,
-    is_same_magnification,
 )
 from semcal_ros.core.calibration.judgement.check import Verdict
-from semcal_ros.core.calibration.judgement.findings import measure_view_coverage
 from semcal_ros.core.calibration.options import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
@@ -71,6 +67,12 @@ from semcal_ros.nodes.acquisition.run import (
     Progress,
     goal_of,
 )
+from semcal_ros.nodes.calibration_state import (
+    CalibrationState,
+    LadderSource,
+    Picture,
+    RunningJob,
+)
 from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
 from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
@@ -80,18 +82,9 @@ from semcal_ros.nodes.frames.conditions import ConditionsInput
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.stage import StageInput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
-from semcal_ros.nodes.workers.calibration_worker import (
-    CalibrationJob,
-    CalibrationProcess,
-    ExtensionJob,
-    Stage,
-    without_images,
-)
-from semcal_ros.workflows.calibrate import options_for
+from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, CalibrationProcess, Stage
 from semcal_ros.workflows.check_and_update import check_found, update_found
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.extend import make_picture
-from semcal_ros.workflows.provenance import describe_views
 
 __all__ = ["CalibrationServer", "main"]
 
@@ -116,23 +109,12 @@ _PARAMETERS = (
 # States of an acquisition that has ended, and how long its thread may take after it has said so.
 _ENDED, _LAST_WORD_S = ("stopped", "failed", "done"), 1.0
 _GOAL = ("lowest_magnification", "highest_magnification", "target")
-# Stamps that are behind by more are of another clock, or of so slow a scan that one follows the other.
-_OTHER_CLOCK_NS = 30 * 10**9
 # Pictures of an acquisition: a slow scan of 4 k x 4 k takes some minutes.
 _PICTURE_S = 600.0
 _POLL_S = 0.1
 
 Goal = TypeVar("Goal", AcquisitionGoal, LadderGoal)
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A frame that may become a view, with what was known when it arrived."""
-
-    frame: StreamFrame
-    visit: int
-    stage: StageReading | None
-    conditions: Conditions
+Answer = TypeVar("Answer")
 
 
 def _free_folder(wanted: Path) -> Path:
@@ -159,31 +141,11 @@ class CalibrationServer(StreamNode):
     def __init__(self) -> None:
         super().__init__("calibration_server", _PARAMETERS)
         self._lock = threading.Lock()
-        self._newest: _Candidate | None = None
-        self._added: StreamFrame | None = None
-        self._views: list[FoundView] = []
-        # How many of them, the first ones, a calibration was made from.
-        self._calibrated_views = 0
-        # Of the same views: their stamps, ns, and how they were taken.
-        self._taken: list[tuple[int, Conditions]] = []
-        self._calibration: Calibration | None = None
-        self._running: CalibrationProcess | None = None
-        self._stage: Stage | None = None
-        self._beside: threading.Thread | None = None
-        # An acquisition, its thread while it runs, and what a person took for its request.
-        self._acquisition: AcquisitionRun | LadderRun | None = None
+        # Frozen: it is read without the lock, and changed by _change.
+        self._state = CalibrationState()
+        self._calibrating: threading.Thread | None = None
         self._acquiring: threading.Thread | None = None
-        self._acquisition_wanted = False
-        self._request: ViewRequest | PictureRequest | None = None
-        # Of the pictures of a ladder: their stamps, ns, and how they were taken.
-        self._told: dict[str, tuple[int, Conditions, StageReading | None]] = {}
-        self._taken_by_hand = ""
         self._recorder: ViewRecorder | None = None
-        # What the acquisition is recorded to, and the recording that it went on with.
-        self.recording: Path | None = None
-        self._resumed: Path | None = None
-        self._first_visit = 0
-        self._pictures = 0
         self._warnings = ScaleWarnings()
         self._output = OutputFile(self.parameters, self.reporter.info)
         self._text = self.endpoints.latched_publisher(String, "calibration")
@@ -192,7 +154,7 @@ class CalibrationServer(StreamNode):
         stream = MutuallyExclusiveCallbackGroup()
         # Before the images, as the magnification.
         self._position = StageInput(self.node_context, stream)
-        self._known = ConditionsInput(self.node_context, group=stream)
+        self._conditions = ConditionsInput(self.node_context, group=stream)
         self.receive_frames(self._on_frame, group=stream)
         name = self.parameters["microscope"]
         self._commands = (
@@ -226,6 +188,18 @@ class CalibrationServer(StreamNode):
         self._report_progress("no views yet")
         self.reporter.info(self._saving)
 
+    def _change(self, event: Callable[[CalibrationState], CalibrationState]) -> CalibrationState:
+        """Go on to the state that an event leads to, and return it; a refusal leaves it as it is."""
+        with self._lock:
+            self._state = event(self._state)
+            return self._state
+
+    def _step(self, event: Callable[[CalibrationState], tuple[CalibrationState, Answer]]) -> Answer:
+        """As :meth:`_change`, for an event that also answers; return the answer."""
+        with self._lock:
+            self._state, answer = event(self._state)
+            return answer
+
     def conditions(self) -> list[str]:
         """Extend the base class: also report what is wrong with the stage and with the last calibration."""
         doubts = [self._warnings.summary] if self._warnings.count else []
@@ -237,19 +211,16 @@ class CalibrationServer(StreamNode):
         return self._output.plan if self.parameters["allow_writing"] else "~/save is switched off"
 
     def _end_calibration(self) -> None:
-        with self._lock:
-            running = self._running
-            self._acquisition_wanted = False
+        running = self._change(CalibrationState.closed).running
         if running is not None:
             running.cancel()
-        for thread in (self._beside, self._acquiring):
+        for thread in (self._calibrating, self._acquiring):
             if thread is not None:
                 thread.join()
 
     def _tell_unused_views(self) -> None:
         """Say at the end what is lost: a replay ends all nodes with its last frame."""
-        with self._lock:
-            count = len(self._views) - self._calibrated_views
+        count = self._state.unused_views
         if count > 0:
             self.reporter.warn(
                 f"{counted(count, 'view')} collected and not calibrated; call ~/calibrate before the end, "
@@ -264,31 +235,11 @@ class CalibrationServer(StreamNode):
             self._report_answer(success, text)
 
     def _report_progress(self, text: str, level: DiagnosticLevel = DiagnosticLevel.OK) -> None:
-        with self._lock:
-            views, stage, acquisition = list(self._views), self._stage, self._acquisition
-        values = [("views", str(len(views)))]
-        values.append(("corners", str(sum(len(view.detection.xy) for view in views))))
-        counts = Counter(view.magnification for view in views)
-        values += [(f"views at {g:g}x", str(counts[g])) for g in sorted(counts)]
-        coverage = measure_view_coverage(views)
-        values.append(("field_share", f"{coverage.field_share:.3f}"))
-        if coverage.tilts_deg:
-            values.append(("least_tilt_deg", f"{min(coverage.tilts_deg):.1f}"))
-            values.append(("largest_tilt_deg", f"{max(coverage.tilts_deg):.1f}"))
-        if stage is not None:
-            values += [("stage", stage.name), ("fraction", f"{stage.fraction:.3f}")]
-        # What ~/acquire would do, and with what: a viewer shows it before it begins.
-        values += [(name, f"{self.parameters[name]:g}") for name in _GOAL]
-        values.append(("microscope", self.parameters["microscope"]))
-        if acquisition is not None:
-            progress = acquisition.progress
-            values += [("acquisition", progress.state), ("request", progress.text)]
-            values += [("taken", str(progress.views)), ("planned", str(progress.planned))]
-            values += [("left_out", str(progress.left_out))]
-            values += [("largest_sigma", f"{progress.largest:.3g}")]
+        settings = {name: f"{self.parameters[name]:g}" for name in _GOAL}
+        settings["microscope"] = self.parameters["microscope"]
         status = DiagnosticStatus()
         name = f"{self.get_fully_qualified_name()}: calibration"
-        summary = DiagnosticSummary(level, text, tuple(values))
+        summary = DiagnosticSummary(level, text, self._state.progress(settings))
         fill_diagnostic_status(status, name, self.config.name, summary)
         self._progress.publish(status)
 
@@ -299,17 +250,12 @@ class CalibrationServer(StreamNode):
         if magnification is None or frame.mixed:
             return
         if self.frames is not None and self.frames.has_rivals:
-            with self._lock:
-                self._newest = None
+            self._change(CalibrationState.without_picture)
             return
-        self._known.take_waiting()
-        conditions = Conditions.from_topic(self._known.current)
-        with self._lock:
-            before = self._newest
-            visit = self._first_visit if before is None else before.visit
-            visit += before is not None and before.frame.magnification != magnification
-            self._newest = _Candidate(frame, visit, self._position.at(frame.stamp_ns), conditions)
-            self._pictures += 1
+        self._conditions.take_waiting()
+        conditions = Conditions.from_topic(self._conditions.current)
+        stage = self._position.at(frame.stamp_ns)
+        self._change(lambda state: state.with_frame(frame, magnification, stage, conditions))
 
     # -- services ----------------------------------------------------------------------------------
 
@@ -319,121 +265,68 @@ class CalibrationServer(StreamNode):
 
     def add_view(self) -> str:
         """Make a view of the newest frame, and say which."""
-        with self._lock:
-            request = self._request
+        request = self._state.request
         text = self._take_view(request)
         if request is not None:
-            with self._lock:
-                self._taken_by_hand = text
+            self._change(lambda state: state.with_answer(text))
         return text
 
     def _take_view(self, request: ViewRequest | PictureRequest | None) -> str:
         """Make use of the newest frame, which must show what was asked for."""
         self._refuse_rivals()
-        with self._lock:
-            newest = self._newest
-        frame = None if newest is None else newest.frame
-        if newest is None or frame is None or frame.magnification is None:
-            raise InvalidValueError(
-                "no frame with a known magnification yet", do="check that the microscope publishes"
-            )
-        if frame is self._added:
-            raise InvalidValueError("the same frame as before", do="wait for the next one")
+        picture = self._state.picture_to_take()
         if request is not None:
-            self._record(newest, frame.magnification)
-            if not is_same_magnification(request.magnification, frame.magnification):
-                raise CalibrationError(
-                    f"a picture at {frame.magnification:g}x",
-                    expected=f"{request.magnification:.0f}x",
-                )
+            self._record(picture)
+            picture.require_magnification_of(request)
         if isinstance(request, PictureRequest):
-            text = self._take_picture(newest, request)
+            text = self._take_picture(picture, request)
         else:
-            text = self._add_view(newest, frame.magnification, request)
-        with self._lock:
-            self._added = frame
-        self.reporter.count_published(frame.stamp_ns)
+            text = self._add_view(picture, request)
+        self.reporter.count_published(picture.frame.stamp_ns)
         return text
 
-    def _take_picture(self, newest: _Candidate, request: PictureRequest) -> str:
+    def _take_picture(self, picture: Picture, request: PictureRequest) -> str:
         """Take a picture for a ladder."""
-        run = self._acquisition
+        run = self._state.acquisition
         assert isinstance(run, LadderRun)
-        picture = self._ladder_picture(newest, f"picture {len(run.taken)}")
-        run.take(request, picture, place_of(newest.stage))
-        told = newest.frame.stamp_ns, newest.conditions, newest.stage
-        with self._lock:
-            self._told[picture.name] = told
+        name = f"picture {len(run.taken)}"
+        run.take(request, picture.to_ladder_picture(name), place_of(picture.stage))
+        self._change(lambda state: state.with_ladder_picture(name, picture))
         return f"picture {len(run.taken)} at {picture.magnification:g}x"
 
-    @staticmethod
-    def _ladder_picture(candidate: _Candidate, name: str) -> LadderPicture:
-        frame = candidate.frame
-        assert frame.magnification is not None
-        # A copy: the memory of a message is used again.
-        grey = np.array(to_gray(frame.image, frame.encoding))
-        picture = make_picture(
-            grey, frame.magnification, name, candidate.stage, candidate.conditions
-        )
-        return replace(picture, visit=candidate.visit)
-
-    def _add_view(
-        self, newest: _Candidate, magnification: float, request: ViewRequest | None
-    ) -> str:
-        """Make a view of the grid."""
-        frame = newest.frame
-        with self._lock:
-            name = f"view {len(self._views)}"
-        grey = to_gray(frame.image, frame.encoding)
+    def _add_view(self, picture: Picture, request: ViewRequest | None) -> str:
+        """Make a view of the grid, and show what was found of it."""
+        grey = picture.grey
         detection = find_lattice(grey)
         message = Image()
         if isinstance(detection, Rejection):
             image = corner_overlay(grey, np.empty((0, 2)), detection.reason)
         else:
             image = corner_overlay(grey, detection.xy, "")
-        fill_image(message, image, "bgr8", frame.header)
+        fill_image(message, image, "bgr8", picture.frame.header)
         self._overlay.publish(message)
-        if isinstance(detection, Rejection):
-            raise CalibrationError(
-                f"no grid found at {magnification:g}x: {detection.reason}",
-                expected="an image filled by the chess grid",
-            )
-        if request is not None and (
-            fault := find_picture_fault(grey, detection, request, newest.stage)
-        ):
-            raise CalibrationError(f"not usable at {magnification:g}x: {fault}")
-        found = FoundView(name, magnification, grey, detection, newest.stage, newest.visit)
-        view = without_images([found])[0]
-        with self._lock:
-            self._views.append(view)
-            self._taken.append((frame.stamp_ns, newest.conditions))
-            count = len(self._views)
-        tilt = None if newest.stage is None else newest.stage.tilt_rad
-        text = f"view {count} at {magnification:g}x with {counted(len(detection.xy), 'corner')}"
-        text += "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
+        view = picture.to_view(detection, request)
+        text = self._step(lambda state: state.with_view(view, picture))
         # Who collects views wants to save a calibration, and can still change where.
-        return text + (f"; {self._saving}" if count == 1 else "")
+        return text + (f"; {self._saving}" if len(self._state.views) == 1 else "")
 
     def _clear(self) -> str:
-        with self._lock:
-            count = len(self._views)
-            self._views.clear()
-            self._calibrated_views = 0
-            self._taken.clear()
-            self._added = None
-            self._position.forget_doubt()
-        return f"{counted(count, 'view')} removed"
+        text = self._step(CalibrationState.cleared)
+        self._position.forget_doubt()
+        return text
 
     def _calibrate(self) -> str:
         return self._complete(self._begin())
 
     def _start_calibration(self) -> str:
         running = self._begin()
-        self._beside = threading.Thread(target=self._complete_beside, args=(running,), daemon=True)
-        self._beside.start()
+        self._calibrating = threading.Thread(
+            target=self._complete_in_thread, args=(running,), daemon=True
+        )
+        self._calibrating.start()
         return f"calibrating from {running.job.source}; ~/progress shows it, ~/cancel ends it"
 
-    def _complete_beside(self, running: CalibrationProcess) -> None:
+    def _complete_in_thread(self, running: CalibrationProcess) -> None:
         """Report, in place of an answer, how a calibration has ended."""
         try:
             success, text = True, self._complete(running)
@@ -455,20 +348,17 @@ class CalibrationServer(StreamNode):
             calibration = Calibration.loads(result.text, source="the calibration process")
             done = True
         finally:
-            wanted = self._finish(running, done=done)
+            wanted = self._step(lambda state: state.with_end_of(running, done=done))
         if not wanted:
             raise CalibrationError("cancelled")
-        if isinstance(running.job, CalibrationJob):
-            with self._lock:
-                self._calibrated_views = len(running.job.views)
-        self._adopt(calibration)
+        job = running.job
+        self._adopt(calibration, len(job.views) if isinstance(job, CalibrationJob) else None)
         return result.summary
 
-    def _adopt(self, calibration: Calibration) -> None:
-        """Publish a calibration, and keep it for ~/save."""
+    def _adopt(self, calibration: Calibration, views: int | None) -> None:
+        """Publish a calibration that was made from so many views, and keep it for ~/save."""
         text = calibration.dumps()
-        with self._lock:
-            self._calibration = calibration
+        self._change(lambda state: state.with_calibration(calibration, views))
         message = String()
         fill_calibration_text(message, text)
         self._text.publish(message)
@@ -477,56 +367,18 @@ class CalibrationServer(StreamNode):
 
     def _begin(self) -> CalibrationProcess:
         self._refuse_rivals()
-        with self._lock:
-            if self._running is not None:
-                raise CalibrationError(
-                    "a calibration is running", do="wait for its end, or call ~/cancel"
-                )
-            if not self._views:
-                raise CalibrationError("no usable view yet", do="call ~/add_view first")
-            views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
-            notes: tuple[str, ...] = ()
-            if (doubt := self._position.doubt) and any(v.stage is not None for v in views):
-                # As from a recording: small angles in degrees have passed for radians.
-                views = tuple(replace(v, stage=None) for v in views)
-                notes = (f"stage: {doubt} looks like degrees: the stage is not used",)
-            config, values = self.config, self.parameters
-            job = CalibrationJob(
-                views,
-                config.display_width_m,
-                config.squares_m,
-                options_for(
-                    config,
-                    CalibrationOptions(method=values["method"], residual=values["residual"]),
-                ),
-                config.grid_certificate,
-                notes,
-                self._describe(views),
-                {v.name: told for v, (_, told) in zip(views, self._taken, strict=True)},
-            )
-            self._running = CalibrationProcess(job)
-            return self._running
+        values, doubt = self.parameters, self._position.doubt
+        options = CalibrationOptions(method=values["method"], residual=values["residual"])
 
-    def _describe(self, views: Sequence[FoundView]) -> Provenance:
-        """Where a calibration from these views, all that there are, comes from; call it with the lock."""
-        seen = {v.name: (told, v.stage) for v, (_, told) in zip(views, self._taken, strict=True)}
-        return describe_views(self.config, seen, [stamp_ns for stamp_ns, _ in self._taken])
+        def begin(state: CalibrationState) -> tuple[CalibrationState, CalibrationProcess]:
+            running = CalibrationProcess(state.calibration_job(self.config, options, doubt))
+            return state.with_job(running), running
 
-    def _finish(self, running: CalibrationProcess, *, done: bool) -> bool:
-        """Allow the next calibration; return False if this one was cancelled."""
-        with self._lock:
-            wanted = self._running is running
-            if wanted:
-                self._running = None
-                self._stage = Stage("done", 1.0) if done else None
-            return wanted
+        return self._step(begin)
 
     def _show(self, running: CalibrationProcess, stage: Stage) -> None:
-        with self._lock:
-            if self._running is not running:
-                return
-            self._stage = stage
-        self._report_progress(f"calibrating from {running.job.source}")
+        if self._change(lambda state: state.with_stage(running, stage)).running is running:
+            self._report_progress(f"calibrating from {running.job.source}")
 
     # -- a calibration that records itself -----------------------------------------------------------
 
@@ -556,51 +408,50 @@ class CalibrationServer(StreamNode):
     ) -> str:
         """Begin a run that makes an acquisition, or go on with the one that has the same goal."""
         self._refuse_rivals()
-        ending = not self._acquisition_wanted and self.acquisition_progress.state in _ENDED
+        ending = not self._state.acquisition_wanted and self.acquisition_progress.state in _ENDED
         if self._acquiring is not None and ending:
             # It has said how it ended, and whoever heard that may call at once.
             self._acquiring.join(_LAST_WORD_S)
         goal = read_goal()
-        with self._lock:
-            if self.acquiring:
-                raise CalibrationError("an acquisition is running", do="call ~/cancel to end it")
-            if self._running is not None:
-                raise CalibrationError(
-                    "a calibration is running", do="wait for its end, or call ~/cancel"
-                )
-            run, verb = self._acquisition, "going on"
-            ended = run is None or run.discarded or run.progress.state == "done"
-            if run is None or ended or run.goal != goal:
-                verb, run = "begun", make_run(goal)
-                self._told.clear()
-            record = self.parameters["record"]
-            if record and not self.parameters["allow_writing"]:
-                raise InvalidValueError(
-                    "writing files is switched off",
-                    do="start the node with allow_writing true, or record nothing",
-                )
-            path = _free_folder(self.parameters.allowed_path(record)) if record else None
-            before = self._recording_to_resume(run)
-            recorder = None if path is None else ViewRecorder(path, self.config)
-            self._acquisition, self._acquisition_wanted, self.recording = run, True, path
-            self._acquiring = threading.Thread(
-                target=self._acquire_beside, args=(run, recorder, before), daemon=True
-            )
-        where = "" if before is None else f" with the views of {before}"
+        if self.acquiring:
+            raise CalibrationError("an acquisition is running", do="call ~/cancel to end it")
+        self._state.refuse_another_job()
+        goes_on = self._state.can_go_on(goal)
+        path = self._free_recording()
+        resumed = None if goes_on else self._recording_to_resume()
+        run = self._step(lambda state: state.with_acquisition(goal, lambda: make_run(goal), path))
+        recorder = None if path is None else ViewRecorder(path, self.config)
+        self._acquiring = threading.Thread(
+            target=self._acquire_in_thread, args=(run, recorder, resumed), daemon=True
+        )
+        where = "" if resumed is None else f" with the views of {resumed}"
         where += "" if path is None else f", recorded to {path}"
+        verb = "going on" if goes_on else "begun"
         text = f"{name} {verb}{where}; ~/progress shows it, ~/cancel ends it"
         # Before the start: an acquisition that fails at once has the last word.
         self._report_progress(text)
         self._acquiring.start()
         return text
 
-    def _recording_to_resume(self, run: AcquisitionRun | LadderRun) -> Path | None:
+    def _free_recording(self) -> Path | None:
+        """The folder that an acquisition is recorded to."""
+        record = self.parameters["record"]
+        if not record:
+            return None
+        if not self.parameters["allow_writing"]:
+            raise InvalidValueError(
+                "writing files is switched off",
+                do="start the node with allow_writing true, or record nothing",
+            )
+        return _free_folder(self.parameters.allowed_path(record))
+
+    def _recording_to_resume(self) -> Path | None:
         """The recording that a new acquisition goes on with, once."""
         text = self.parameters["resume"]
-        if not text or run is self._acquisition:
+        if not text:
             return None
         path = self.parameters.allowed_path(text)
-        if path == self._resumed:
+        if path == self._state.resumed:
             return None
         if not path.exists():
             raise InvalidValueError(
@@ -612,8 +463,6 @@ class CalibrationServer(StreamNode):
 
     def _resume(self, run: AcquisitionRun | LadderRun, path: Path) -> None:
         """Take over the pictures of a recording, and record them again, so that the new recording has all."""
-        with self._lock:
-            newest = self._newest
 
         def on_frame(frame: RecordedFrame) -> None:
             if not self._still_acquiring():
@@ -623,37 +472,21 @@ class CalibrationServer(StreamNode):
                 g, stage = frame.magnification, frame.stage
                 self._recorder.write(frame.image, frame.encoding, frame.stamp_ns, g, stage, known)
 
+        newest = self._state.newest
         size = None if newest is None else newest.frame.size
         try:
             if isinstance(run, LadderRun):
                 visits = self._resume_ladder(run, path, size, on_frame)
             else:
-                visits = self._resume_views(run, path, size, on_frame)
+                taken = read_views(path, self.config, size, run.adopt, on_frame)
+                self._change(lambda state: state.with_recorded_views(taken))
+                visits = [one.view.visit for one in taken if one.view.visit is not None]
         except NODE_ERRORS:
             # With a part of them: the next call begins anew.
             run.discarded = True
             raise
-        with self._lock:
-            self._resumed = path
-            # What comes now was set anew.
-            self._first_visit = 1 + max(visits, default=-1)
-            if self._newest is not None:
-                self._newest = replace(self._newest, visit=self._newest.visit + self._first_visit)
+        self._change(lambda state: state.with_resumed(path, visits))
         run.report(f"{counted(len(visits), run.unit)} taken over from {path}")
-
-    def _resume_views(
-        self,
-        run: AcquisitionRun,
-        path: Path,
-        size: tuple[int, int] | None,
-        on_frame: Callable[[RecordedFrame], object],
-    ) -> list[int]:
-        """Take over views of a grid; return their visits."""
-        taken = read_views(path, self.config, size, run.adopt, on_frame)
-        with self._lock:
-            self._views += without_images([one.view for one in taken])
-            self._taken += [(one.stamp_ns, one.conditions) for one in taken]
-        return [one.view.visit for one in taken if one.view.visit is not None]
 
     def _resume_ladder(
         self,
@@ -671,15 +504,15 @@ class CalibrationServer(StreamNode):
             picture = make_picture(grey, frame.magnification, name, frame.stage, known)
             if not run.adopt(picture, place_of(frame.stage)):
                 return False
-            with self._lock:
-                self._told[name] = frame.stamp_ns, known, frame.stage
+            source = LadderSource(frame.stamp_ns, known, frame.stage)
+            self._change(lambda state: state.with_ladder_source(name, source))
             return True
 
         visits = read_pictures(path, self.config, size, adopt, on_frame)
         run.number_visits(visits)
         return visits
 
-    def _acquire_beside(
+    def _acquire_in_thread(
         self, run: AcquisitionRun | LadderRun, recorder: ViewRecorder | None, resumed: Path | None
     ) -> None:
         """Run an acquisition, and say how it has ended."""
@@ -699,24 +532,28 @@ class CalibrationServer(StreamNode):
         except NODE_ERRORS as error:
             text, level, state = " ".join(str(error).split()), DiagnosticLevel.WARN, "failed"
         finally:
-            with self._lock:
-                self._recorder, self._request = None, None
-                self._acquisition_wanted = False
+            self._recorder = None
+            self._change(CalibrationState.with_end_of_acquisition)
         run.progress = replace(run.progress, state=state, text=text)
         if self.context.ok():
             self._report_progress(f"acquisition {state}: {text}", level)
-            told = f"{run.service}: {text}"
-            (self.reporter.info if state == "done" else self.reporter.warn)(told)
+            last = f"{run.service}: {text}"
+            (self.reporter.info if state == "done" else self.reporter.warn)(last)
 
     @property
     def has_picture(self) -> bool:
         """Whether there is a frame with a known magnification."""
-        return self._newest is not None
+        return self._state.newest is not None
 
     @property
     def has_calibration(self) -> bool:
         """Whether there is something to save."""
-        return self._calibration is not None
+        return self._state.calibration is not None
+
+    @property
+    def recording(self) -> Path | None:
+        """What the acquisition is recorded to."""
+        return self._state.recording
 
     @property
     def acquiring(self) -> bool:
@@ -724,99 +561,66 @@ class CalibrationServer(StreamNode):
         return self._acquiring is not None and self._acquiring.is_alive()
 
     @property
+    def acquisition_unit(self) -> str:
+        """What one picture of the acquisition is called."""
+        run = self._state.acquisition
+        return "view" if run is None else run.unit
+
+    @property
     def acquisition_progress(self) -> Progress:
         """How far the acquisition is, or how it has ended."""
-        return (
-            Progress("stopped", "not begun")
-            if self._acquisition is None
-            else self._acquisition.progress
-        )
+        run = self._state.acquisition
+        return Progress("stopped", "not begun") if run is None else run.progress
 
     @property
     def acquisition_reached(self) -> bool:
         """Whether an acquisition has met what was asked for."""
-        run = self._acquisition
+        run = self._state.acquisition
         return run is not None and run.progress.state == "done" and run.reached
 
-    @property
-    def _service(self) -> str:
-        """What goes on with the acquisition."""
-        return "~/acquire" if self._acquisition is None else self._acquisition.service
-
     def _still_acquiring(self) -> bool:
-        return self._acquisition_wanted and self.context.ok()
+        return self._state.acquisition_wanted and self.context.ok()
 
-    def _record(self, newest: _Candidate, magnification: float) -> None:
+    def _record(self, picture: Picture) -> None:
         recorder = self._recorder
         if recorder is not None:
-            frame = newest.frame
+            frame, g = picture.frame, picture.magnification
             recorder.write(
-                frame.image,
-                frame.encoding,
-                frame.stamp_ns,
-                magnification,
-                newest.stage,
-                newest.conditions,
+                frame.image, frame.encoding, frame.stamp_ns, g, picture.stage, picture.conditions
             )
 
     def wait_for_pictures(self, count: int) -> None:
         """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
-        with self._lock:
-            wanted = self._pictures + count
+        wanted = self._state.pictures + count
         asked_ns = self.get_clock().now().nanoseconds
+        self._wait_until(
+            lambda: self._state.has_new_picture(wanted, asked_ns),
+            MicroscopeError("no picture comes any more"),
+            _PICTURE_S,
+        )
 
-        def there() -> bool:
-            with self._lock:
-                newest = self._newest
-                if self._pictures < wanted or newest is None:
-                    return False
-            # Pictures of a scan that began before may still come, more than one where they overlap.
-            late_ns = asked_ns - newest.frame.stamp_ns
-            return late_ns <= 0 or late_ns > _OTHER_CLOCK_NS
-
-        self._wait_until(there, MicroscopeError("no picture comes any more"), _PICTURE_S)
-
-    def look(self) -> LatticeDetection | None:
-        """See :class:`~semcal_ros.nodes.acquisition.follow.Lookout`."""
-        with self._lock:
-            newest = self._newest
-        if newest is None:
-            return None
-        found = find_lattice(to_gray(newest.frame.image, newest.frame.encoding))
+    def find_grid(self) -> LatticeDetection | None:
+        """See :class:`~semcal_ros.nodes.acquisition.follow.GridFinder`."""
+        newest = self._state.newest
+        found = None if newest is None else find_lattice(newest.grey)
         return None if isinstance(found, Rejection) else found
 
     def newest_picture(self) -> LadderPicture | None:
         """See :class:`~semcal_ros.nodes.acquisition.ladder.LadderTaker`."""
-        with self._lock:
-            newest = self._newest
-        return None if newest is None else self._ladder_picture(newest, "")
+        newest = self._state.newest
+        return None if newest is None else newest.to_ladder_picture("")
 
     def extend_calibration(self, run: LadderRun) -> str:
         """See :class:`~semcal_ros.nodes.acquisition.ladder.LadderTaker`."""
         self._refuse_rivals()
-        calibration = run.goal.calibration
         pictures = tuple(one.picture for one in run.taken)
-        compared = ConditionsComparison(calibration, scans_may_turn=True)
-        with self._lock:
-            self._request = None
-            told = [self._told[picture.name] for picture in pictures]
-            for _, conditions, _ in told:
-                compared.add(conditions)
-            seen = {
-                picture.name: (conditions, stage)
-                for picture, (_, conditions, stage) in zip(pictures, told, strict=True)
-            }
-            notes = compared.notes
-            if doubt := self._position.doubt:
-                # As from a recording: small angles in degrees have passed for radians.
-                pictures = tuple(replace(picture, scan_rotation_rad=None) for picture in pictures)
-                notes = (*notes, f"stage: {doubt} looks like degrees: the stage is not used")
-            origin = describe_views(self.config, seen, [stamp_ns for stamp_ns, _, _ in told])
-            running = CalibrationProcess(
-                ExtensionJob(calibration, pictures, self.config, origin, notes)
-            )
-            self._running = running
-        return self._complete(running)
+        base, doubt = run.goal.calibration, self._position.doubt
+
+        def begin(state: CalibrationState) -> tuple[CalibrationState, CalibrationProcess]:
+            running = CalibrationProcess(state.extension_job(self.config, base, pictures, doubt))
+            return state.without_request().with_job(running), running
+
+        return self._complete(self._step(begin))
 
     def take(self, request: ViewRequest | PictureRequest) -> str:
         """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
@@ -827,23 +631,22 @@ class CalibrationServer(StreamNode):
 
     def wait_for_view(self, request: ViewRequest | PictureRequest) -> str:
         """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
-        with self._lock:
-            self._request, self._taken_by_hand = request, ""
-        self._wait_until(lambda: bool(self._taken_by_hand), CalibrationError("no view"), math.inf)
-        return self._taken_by_hand
+        self._change(lambda state: state.with_request(request))
+        self._wait_until(
+            lambda: bool(self._state.taken_by_hand), CalibrationError("no view"), math.inf
+        )
+        return self._state.taken_by_hand
 
     def stage(self) -> StageReading | None:
         """See :class:`~semcal_ros.nodes.acquisition.run.Taker`."""
-        with self._lock:
-            return None if self._newest is None else self._newest.stage
+        newest = self._state.newest
+        return None if newest is None else newest.stage
 
     def calibrate(self) -> Calibration:
         """See :class:`~semcal_ros.nodes.acquisition.run.ViewTaker`."""
-        with self._lock:
-            self._request = None
+        self._change(CalibrationState.without_request)
         self._complete(self._begin())
-        with self._lock:
-            calibration = self._calibration
+        calibration = self._state.calibration
         if calibration is None:
             raise CalibrationError("no calibration came of the views")
         return calibration
@@ -861,42 +664,32 @@ class CalibrationServer(StreamNode):
         end_s = time.monotonic() + limit_s
         while not condition():
             if not self._still_acquiring():
-                raise CalibrationError("stopped", do=f"call {self._service} to go on")
+                raise CalibrationError("stopped", do=f"call {self._state.service} to go on")
             if time.monotonic() > end_s:
                 raise late
             time.sleep(_POLL_S)
 
     def _cancel(self) -> str:
-        with self._lock:
-            acquiring = self._acquisition_wanted
-            self._acquisition_wanted = False
-            running, self._running, self._stage = self._running, None, None
-        if acquiring:
-            if running is not None:
-                running.cancel()
-            return f"the acquisition ends as soon as nothing moves; {self._service} goes on with it"
-        if running is None:
-            raise CalibrationError("no calibration is running")
-        running.cancel()
-        return f"cancelled the {running.job.title} after {running.elapsed_s:.1f} s"
+        def cancel(
+            state: CalibrationState,
+        ) -> tuple[CalibrationState, tuple[RunningJob | None, str]]:
+            after, running, text = state.cancelled()
+            return after, (running, text)
+
+        running, text = self._step(cancel)
+        if running is not None:
+            running.cancel()
+        return text
 
     def _compared(self) -> tuple[Calibration, tuple[FoundView, ...], Provenance]:
         """The calibration that is checked or renewed, the views that say so, and their origin."""
         self._refuse_rivals()
-        with self._lock:
-            views = tuple(replace(v, name=f"view {i}") for i, v in enumerate(self._views))
-            if self._position.doubt:
-                views = tuple(replace(v, stage=None) for v in views)
-            origin = self._describe(views)
-        if not views:
-            raise CalibrationError("no usable view yet", do="call ~/add_view first")
-        calibration = self._base()
-        return calibration, views, origin
+        views, origin = self._state.compared(self.config, self._position.doubt)
+        return self._base(), views, origin
 
     def _base(self) -> Calibration:
         """The calibration that was made here, else that of the file."""
-        with self._lock:
-            calibration = self._calibration
+        calibration = self._state.calibration
         if calibration is not None:
             return calibration
         path = self.parameters["calibration"]
@@ -918,9 +711,7 @@ class CalibrationServer(StreamNode):
     def _update(self) -> str:
         calibration, views, origin = self._compared()
         done = update_found(calibration, views, self.config, origin)
-        with self._lock:
-            self._calibrated_views = len(views)
-        self._adopt(Calibration.from_model(done.model))
+        self._adopt(Calibration.from_model(done.model), len(views))
         return f"updated; before, it was {done.check.summary}"
 
     def save(self) -> str:
@@ -929,11 +720,7 @@ class CalibrationServer(StreamNode):
             raise InvalidValueError(
                 "writing files is switched off", do="start the node with allow_writing true"
             )
-        with self._lock:
-            calibration = self._calibration
-        if calibration is None:
-            raise InvalidValueError("no calibration to save", do="call ~/calibrate first")
-        return self._output.write(calibration.save)
+        return self._output.write(self._state.calibration_to_save().save)
 
 
 def main(args: Sequence[str] | None = None) -> int:
