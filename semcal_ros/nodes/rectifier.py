@@ -54,7 +54,7 @@ class RectifierNode(CalibratedStreamNode):
             if g is None:
                 return
             camera = self.camera(frame, g)
-        self.rectifier.rectify(frame.image, camera, out=self.output.memory(frame))
+        self.output.render(frame, camera)
         self.publish(camera, frame)
 
 

@@ -28,7 +28,6 @@ from semcal_ros.core.camera.calibrated_frame import (
     rectified_projection,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.common.parameters import (
     CALIBRATION,
     INTERPOLATION,
@@ -61,7 +60,7 @@ _WITHOUT_CAMERA = (
 
 
 class CalibratedStreamNode(StreamNode):
-    """A stream node with a calibration, a rectifier, and the outputs of :class:`RectifiedOutput`."""
+    """A stream node with a calibration, and the outputs of :class:`RectifiedOutput`."""
 
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         super().__init__(
@@ -75,8 +74,6 @@ class CalibratedStreamNode(StreamNode):
                 *declarations,
             ),
         )
-        self.rectifier = Rectifier(self.parameters["interpolation"])
-        self.parameters.on_change("interpolation", self._set_interpolation)
         self.calibration = CalibrationInput(self.node_context, on_change=self.on_calibration)
         self.output = RectifiedOutput(self.node_context)
         # After the last compressed image.
@@ -98,9 +95,6 @@ class CalibratedStreamNode(StreamNode):
         super().receive_frames(
             on_frame, magnification_config=lambda: self.calibration.config, **options
         )
-
-    def _set_interpolation(self, value: str) -> None:
-        self.rectifier = Rectifier(value)
 
     def camera(self, frame: StreamFrame, magnification: float) -> ScanCamera | None:
         """Return the calibrated camera of a frame, or None while there is no calibration."""

@@ -36,7 +36,10 @@ from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import fill_image, pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.frames.compressed import CompressedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame
 
@@ -50,7 +53,8 @@ __all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
 class ImageOutput:
     """Publishes images on one topic, from memory that is reused for each image, and compressed copies beside it.
 
-    The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
+    The node declares :data:`~semcal_ros.nodes.common.parameters.INTERPOLATION` and the parameters of
+    :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
 
     Attributes
     ----------
@@ -65,15 +69,33 @@ class ImageOutput:
         self._message = Image()
         self._publisher = context.endpoints.stream_publisher(Image, topic)
         self._compressed = CompressedOutput(context, topic)
+        self._scan = context.config.scan
+        self._set_interpolation(context.parameters[INTERPOLATION.name])
+        context.parameters.on_change(INTERPOLATION.name, self._set_interpolation)
         self.pixels: NDArray[Any] = np.empty(0)
         self.reuses_memory = True
 
-    def memory(self, frame: StreamFrame) -> NDArray[Any]:
-        """Return the memory for the pixels of the image made from ``frame``."""
+    def render(
+        self, frame: StreamFrame, camera: ScanCamera | None, drift: RasterDrift | None = None
+    ) -> None:
+        """Rectify a frame into the memory, in one interpolation; raises as :meth:`Rectifier.rectify`.
+
+        Parameters
+        ----------
+        frame
+            The raw image, and its header.
+        camera
+            Whose distortion is taken out; None for none.
+        drift
+            What is taken out with it.
+        """
         if not self.reuses_memory:
             self._message = Image()
         self.pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
-        return self.pixels
+        self._rectifier.rectify(frame.image, camera, drift, self._scan, out=self.pixels)
+
+    def _set_interpolation(self, value: str) -> None:
+        self._rectifier = Rectifier(value)
 
     def publish(self, frame: StreamFrame) -> None:
         """Publish the image in the memory."""
@@ -164,9 +186,11 @@ class RectifiedOutput:
             ),
         )
 
-    def memory(self, frame: StreamFrame) -> NDArray[Any]:
-        """As :meth:`ImageOutput.memory`."""
-        return self._image.memory(frame)
+    def render(
+        self, frame: StreamFrame, camera: ScanCamera | None, drift: RasterDrift | None = None
+    ) -> None:
+        """As :meth:`ImageOutput.render`."""
+        self._image.render(frame, camera, drift)
 
     def close(self) -> None:
         """As :meth:`ImageOutput.close`."""
