@@ -19,50 +19,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import click
-
-from semcal_ros.cli.options import squares_option
-from semcal_ros.core.calibration.start import UNTILTED_MODES
-from semcal_ros.core.corners import PATTERNS
+from semcal_ros.cli.options import given_options, make_option
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.workflows.find_grid import PATTERN, UNTILTED
+from semcal_ros.workflows.options import SQUARES, OptionField
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-def _parse_untilted(
-    _context: click.Context, _parameter: click.Parameter, text: str
-) -> str | tuple[str, ...]:
-    if text in UNTILTED_MODES:
-        return text
-    return tuple(part.strip() for part in text.split(",") if part.strip())
-
-
 def squares_and_pattern(command: Command) -> Command:
     """``--squares`` and ``--pattern``."""
-    pattern = click.option(
-        "--pattern",
-        type=click.Choice(PATTERNS),
-        default="auto",
-        show_default=True,
-        help="What the grid consists of: chess squares, dots or holes, crosses, crossed lines, or a grating of "
-        "parallel lines, which is turned and not tilted.",
-    )
-    squares = squares_option(
-        "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
-    )
-    return squares(pattern(command))
+    squares = make_option(OptionField("squares", Any, None, SQUARES))
+    return squares(make_option(OptionField("pattern", str, "auto", PATTERN))(command))
 
 
 def grid_options(command: Command) -> Command:
     """``--squares``, ``--pattern`` and ``--untilted``."""
-    untilted = click.option(
-        "--untilted",
-        callback=_parse_untilted,
-        default="auto",
-        show_default=True,
-        metavar="auto|all|none|N,N,...",
-        help="Frames without tilt, by number or by file name, if no stage says the tilts.",
-    )
+    untilted = make_option(OptionField("untilted", Any, "auto", UNTILTED))
     return squares_and_pattern(untilted(command))
 
 
@@ -79,12 +52,11 @@ def refuse_grid_options(why: str) -> None:
     InvalidValueError
         If one was given, even with the value of its default.
     """
-    context = click.get_current_context()
-    for name in ("squares", "pattern", "untilted"):
-        # Its value may be None, or equal to the default, although it was given.
-        if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
+    given = given_options()
+    for name in ("--squares", "--pattern", "--untilted"):
+        if name in given:
             raise InvalidValueError(
-                f"--{name}, which is about a grid; {why}",
+                f"{name}, which is about a grid; {why}",
                 expected="one of the two",
-                do=f"leave out --{name}",
+                do=f"leave out {name}",
             )

@@ -39,7 +39,7 @@ from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.synthetic import preset
 from tests.helpers.node_scenes import make_calibration
-from tests.helpers.project import NODES, ROOT
+from tests.helpers.project import NODES, ROOT, load_script
 
 DOC = ROOT / "doc"
 PAGES = [ROOT / "README.md", *sorted(DOC.rglob("*.md"))]
@@ -152,6 +152,13 @@ def test_every_option_is_described(command: str) -> None:
     # Those of the introduction: the output is in every example.
     options -= {"--output"}
     assert {name for name in options if name not in text} == set()
+
+
+def test_the_tables_of_options_are_those_of_the_commands() -> None:
+    scripts = load_script("option_tables")
+    page = _text("cli.md")
+    assert len(scripts.TABLE.findall(page)) >= 4
+    assert scripts.write_tables(page) == page, "run python scripts/option_tables.py"
 
 
 def test_named_options_exist() -> None:
