@@ -32,8 +32,6 @@ from semcal_ros.nodes.calibration_server import CalibrationServer
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 
-__all__ = ["run_acquisition"]
-
 # As long as a slow scan may take, and the middleware to find a microscope.
 _FIRST_PICTURE_S = 60.0
 _POLL_S = 0.1

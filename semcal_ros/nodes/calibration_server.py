@@ -70,8 +70,8 @@ from semcal_ros.nodes.acquisition.run import (
 from semcal_ros.nodes.calibration_state import (
     CalibrationState,
     LadderSource,
-    Picture,
     RunningJob,
+    StreamPicture,
 )
 from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
 from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
@@ -85,8 +85,6 @@ from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, CalibrationProcess, Stage
 from semcal_ros.workflows.check_and_update import check_found, update_found
 from semcal_ros.workflows.extend import make_picture
-
-__all__ = ["CalibrationServer", "main"]
 
 _PARAMETERS = (
     ParameterDeclaration("method", "joint", "Calibration method.", choices=tuple(METHODS)),
@@ -285,7 +283,7 @@ class CalibrationServer(StreamNode):
         self.reporter.count_published(picture.frame.stamp_ns)
         return text
 
-    def _take_picture(self, picture: Picture, request: PictureRequest) -> str:
+    def _take_picture(self, picture: StreamPicture, request: PictureRequest) -> str:
         """Take a picture for a ladder."""
         run = self._state.acquisition
         assert isinstance(run, LadderRun)
@@ -294,7 +292,7 @@ class CalibrationServer(StreamNode):
         self._change(lambda state: state.with_ladder_picture(name, picture))
         return f"picture {len(run.taken)} at {picture.magnification:g}x"
 
-    def _add_view(self, picture: Picture, request: ViewRequest | None) -> str:
+    def _add_view(self, picture: StreamPicture, request: ViewRequest | None) -> str:
         """Make a view of the grid, and show what was found of it."""
         grey = picture.grey
         detection = find_lattice(grey)
@@ -581,7 +579,7 @@ class CalibrationServer(StreamNode):
     def _still_acquiring(self) -> bool:
         return self._state.acquisition_wanted and self.context.ok()
 
-    def _record(self, picture: Picture) -> None:
+    def _record(self, picture: StreamPicture) -> None:
         recorder = self._recorder
         if recorder is not None:
             frame, g = picture.frame, picture.magnification

@@ -115,7 +115,7 @@ class RunningJob(Protocol):
 
 
 @dataclass(frozen=True)
-class Picture:
+class StreamPicture:
     """A frame with a known magnification, and what was known when it arrived."""
 
     frame: Frame
@@ -198,7 +198,7 @@ class CalibrationState:
         What the acquisition is recorded to, and the recording that it went on with.
     """
 
-    newest: Picture | None = None
+    newest: StreamPicture | None = None
     pictures: int = 0
     used: Frame | None = None
     first_visit: int = 0
@@ -228,14 +228,14 @@ class CalibrationState:
         before = self.newest
         visit = self.first_visit if before is None else before.visit
         visit += before is not None and before.magnification != magnification
-        newest = Picture(frame, magnification, visit, stage, conditions)
+        newest = StreamPicture(frame, magnification, visit, stage, conditions)
         return replace(self, newest=newest, pictures=self.pictures + 1)
 
     def without_picture(self) -> CalibrationState:
         """Forget the newest picture: nobody knows which microscope it is of."""
         return replace(self, newest=None)
 
-    def picture_to_take(self) -> Picture:
+    def picture_to_take(self) -> StreamPicture:
         """Return the newest picture; raises :class:`InvalidValueError` if there is none, or none that is new."""
         if self.newest is None:
             raise InvalidValueError(
@@ -245,7 +245,7 @@ class CalibrationState:
             raise InvalidValueError("the same frame as before", do="wait for the next one")
         return self.newest
 
-    def with_view(self, view: FoundView, picture: Picture) -> tuple[CalibrationState, str]:
+    def with_view(self, view: FoundView, picture: StreamPicture) -> tuple[CalibrationState, str]:
         """Add a view; also return what it is, in words."""
         view = replace(view, name=f"view {len(self.views)}")
         taken = RecordedView(view, picture.frame.stamp_ns, picture.conditions)
@@ -256,7 +256,7 @@ class CalibrationState:
         text += "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
         return replace(self, views=views, used=picture.frame), text
 
-    def with_ladder_picture(self, name: str, picture: Picture) -> CalibrationState:
+    def with_ladder_picture(self, name: str, picture: StreamPicture) -> CalibrationState:
         """Take note of a picture that a ladder has taken."""
         source = LadderSource(picture.frame.stamp_ns, picture.conditions, picture.stage)
         return replace(self.with_ladder_source(name, source), used=picture.frame)

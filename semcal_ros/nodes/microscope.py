@@ -41,8 +41,6 @@ from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.source_output import SourceOutput
 
-__all__ = ["Microscope", "main"]
-
 _PARAMETERS = (
     ParameterDeclaration(
         "source", "folder", "What the frames come from.", choices=tuple(SOURCES), fixed=True

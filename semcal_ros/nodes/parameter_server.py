@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -30,8 +31,12 @@ from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.bridge.projection import fill_projection, fill_projection_covariance
-from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.bridge.static_frames import StaticFrame, fill_static_frames, static_frames
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import ConfigError, InvalidValueError, SemcalError
+from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.parameters import (
     CALIBRATION,
     REPLAYED_CALIBRATION,
@@ -42,12 +47,9 @@ from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.frames.static_frames import StaticFramesOutput
 
 if TYPE_CHECKING:
     from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
-
-__all__ = ["ParameterServer", "main"]
 
 _SIZE = (
     ParameterDeclaration(
@@ -73,6 +75,39 @@ _LISTEN_FIRST_S, _LISTEN_AT_MOST_S = 3.0, 5.0
 _TICK_S = 0.5
 # How soon another publisher of `camera_info`, or its end, is noticed: about as long as discovery takes.
 _WATCH_S = 0.5
+
+
+class StaticFramesOutput:
+    """The topic ``/tf_static``, which begins with the microscope's frames and is renewed when one of them changes.
+
+    Parameters
+    ----------
+    context
+        Of the node; its configuration names the frame of the images, and says how the stage is turned.
+    """
+
+    def __init__(self, context: NodeContext) -> None:
+        self._config = context.config
+        self._clock = context.node.get_clock()
+        self._published: tuple[StaticFrame, ...] = ()
+        self._new_message: Any = None
+        try:
+            self._new_message = message_class("tf2_msgs/msg/TFMessage")
+        except ConfigError:
+            # tf2 is not on PyPI, and who has no tf2 needs no frames.
+            return
+        self._publisher = context.endpoints.latched_publisher(self._new_message, "/tf_static")
+        self.publish(None)
+
+    def publish(self, camera: ScanCamera | None) -> None:
+        """Tell the frames of a camera, if they are others than before."""
+        frames = static_frames(self._config, camera)
+        if self._new_message is None or frames == self._published:
+            return
+        self._published = frames
+        message = self._new_message()
+        fill_static_frames(message, frames, self._clock.now().nanoseconds, TransformStamped)
+        self._publisher.publish(message)
 
 
 class ParameterServer(SemNode):

@@ -23,8 +23,6 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
 from semcal_ros.nodes.frames.stream import StreamFrame
 
-__all__ = ["RectifierNode", "main"]
-
 _INPUT = ParameterDeclaration(
     "input",
     "raw",

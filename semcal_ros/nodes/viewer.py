@@ -69,8 +69,6 @@ from semcal_ros.viewer.state import (
     drift_in_pixels,
 )
 
-__all__ = ["Viewer", "give_way", "run_viewer"]
-
 _PARAMETERS = (
     CALIBRATION,
     REPLAYED_CALIBRATION,

@@ -64,8 +64,6 @@ from semcal_ros.synthetic import (
 )
 from semcal_ros.synthetic.pose import rotation_about_beam
 
-__all__ = ["VirtualSem", "main"]
-
 _PARAMETERS = (
     replace(CONFIG, default="virtual_sem"),
     ParameterDeclaration("preset", "jsm820", "Microscope.", choices=tuple(PRESETS), fixed=True),

@@ -51,8 +51,6 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.provenance import describe_computation, describe_provenance
 
-__all__ = ["RecordingCheck", "RecordingUpdate", "check", "check_found", "update", "update_found"]
-
 
 @dataclass(frozen=True)
 class RecordingCheck:
@@ -133,7 +131,7 @@ def check_found(
     return _check(calibration, _arrange(found, (), config, config.squares_m, "auto", ()))
 
 
-def _check(model: Calibration, seen: _Seen) -> CalibrationCheck:
+def _check(model: Calibration, seen: _GridRecording) -> CalibrationCheck:
     return check_calibration(
         model, seen.views, image_size=seen.image_size, untilted=seen.untilted, axis=seen.axis
     )
@@ -217,7 +215,7 @@ def update_found(
 
 
 def _update(
-    model: Calibration, seen: _Seen, ageing: float, provenance: Provenance
+    model: Calibration, seen: _GridRecording, ageing: float, provenance: Provenance
 ) -> CalibrationUpdate:
     result = update_calibration(
         model,
@@ -231,7 +229,7 @@ def _update(
     return replace(result, model=replace(result.model, provenance=provenance))
 
 
-class _Seen(NamedTuple):
+class _GridRecording(NamedTuple):
     """The views of a recording, and what goes with them."""
 
     views: tuple[GridView, ...]
@@ -253,7 +251,7 @@ def _see(
     untilted: str | Sequence[str],
     pattern: str,
     on_progress: OnProgress,
-) -> _Seen:
+) -> _GridRecording:
     """Find the grid in a recording."""
     microscope = resolve_config(config, model)
     sizes = microscope.squares_m if squares_m is None else check_positives(squares_m, "squares_m")
@@ -284,12 +282,12 @@ def _arrange(
     untilted: str | Sequence[str],
     notes: tuple[str, ...],
     frames: Mapping[str, RecordedFrame] = MappingProxyType({}),
-) -> _Seen:
+) -> _GridRecording:
     """Give found corners their places on the grid."""
     collected = collect_views(
         found, rejected, display_width_m=microscope.display_width_m, squares_m=squares_m
     )
-    return _Seen(
+    return _GridRecording(
         tuple(collected.views),
         collected.image_size,
         name_untilted(untilted, found),

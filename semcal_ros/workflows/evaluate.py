@@ -43,8 +43,6 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.workers import open_workers
 
-__all__ = ["Evaluation", "MagnificationError", "evaluate"]
-
 # 1-sigma of the heights on a stage if the calibration does not contain it.
 _HEIGHT_SIGMA_M = 1e-4
 

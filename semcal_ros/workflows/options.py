@@ -55,6 +55,11 @@ class Keyword:
 
     text: str
 
+    @property
+    def in_python(self) -> str:
+        """What the keyword means."""
+        return self.text
+
 
 @dataclass(frozen=True)
 class Option(Keyword):
@@ -89,6 +94,11 @@ class Option(Keyword):
     required: bool = False
     repeated: bool = False
     python: str = ""
+
+    @property
+    def in_python(self) -> str:
+        """Extend the base class: with what is true of the keyword only."""
+        return f"{self.text} {self.python}".rstrip()
 
 
 # Shared by several workflows and commands.
@@ -155,7 +165,7 @@ def keywords_of(
 ) -> Callable[[Callable[[Source, Options], Result]], Callable[Concatenate[Source, Given], Result]]:
     """Let a function of something and a dataclass of options take the fields of the dataclass as its keywords.
 
-    Its docstring gets a list of the keywords and what they mean.
+    Its docstring gets a list of the keywords and what they mean; the dataclass is its attribute ``options``.
 
     Examples
     --------
@@ -190,7 +200,7 @@ def keywords_of(
             return function(source, cast("Callable[..., Options]", options)(**bound))
 
         call.__doc__ = _with_keywords(inspect.getdoc(function) or "", described)
-        vars(call)["__signature__"] = signature
+        vars(call).update(__signature__=signature, options=options)
         return cast("Callable[Concatenate[Source, Given], Result]", call)
 
     return decorate
@@ -200,7 +210,6 @@ def _with_keywords(text: str, described: list[OptionField]) -> str:
     """A docstring with what the keywords mean, before its other sections."""
     lines = ["Keyword arguments", "-----------------"]
     for one in described:
-        more = one.meaning.python if isinstance(one.meaning, Option) else ""
-        lines += [one.name, f"    {one.meaning.text} {more}".rstrip()]
+        lines += [one.name, f"    {one.meaning.in_python}"]
     summary, section, rest = text.partition("\n\nRaises\n")
     return "\n".join([summary, "", *lines]) + section + rest

@@ -461,7 +461,7 @@ def _choose_usable(selection: FrameSelection) -> Mask:
     return usable
 
 
-class _Frame(NamedTuple):
+class _ChosenFrame(NamedTuple):
     """A chosen frame: its number among them, and what it needs to be added."""
 
     number: int
@@ -479,7 +479,7 @@ def _read_chosen(
     used: Mask,
     unused_too: bool,
     masks: bool = False,
-) -> Iterator[_Frame]:
+) -> Iterator[_ChosenFrame]:
     """Read the chosen frames, of which a video shows those, too, that are not used; with masks where they are wanted,
     which a frame would else carry to the workers for nothing.
     """
@@ -491,11 +491,13 @@ def _read_chosen(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        yield _Frame(number, grey, camera, drift, bool(used[number]), frame.mask if masks else None)
+        yield _ChosenFrame(
+            number, grey, camera, drift, bool(used[number]), frame.mask if masks else None
+        )
 
 
 def add_part(
-    frames: Iterable[_Frame],
+    frames: Iterable[_ChosenFrame],
     scan: ScanTiming | None,
     size: tuple[int, int],
     interpolation: str,

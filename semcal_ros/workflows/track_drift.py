@@ -49,8 +49,6 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 
-__all__ = ["DriftTrack", "describe_forecast", "describe_rate", "track_drift"]
-
 
 @dataclass(frozen=True, eq=False)
 class DriftTrack:

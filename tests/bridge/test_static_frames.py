@@ -28,7 +28,7 @@ from semcal_ros.bridge.static_frames import fill_static_frames, static_frames
 from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.nodes.frames import static_frames as output
+from semcal_ros.nodes import parameter_server as output
 from tests.helpers.node_fakes import fake_context
 from tests.helpers.node_scenes import make_calibration
 

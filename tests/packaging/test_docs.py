@@ -191,7 +191,12 @@ class _Captured(Exception):
 def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, ParameterDeclaration]:
     """What a node declares, without ROS at work."""
     module = importlib.import_module(f"semcal_ros.nodes.{node}")
-    (kind,) = (name for name in module.__all__ if name != "main")
+    (kind,) = (
+        made
+        for made in vars(module).values()
+        if isinstance(made, type) and issubclass(made, base.SemNode)
+        if made.__module__ == module.__name__
+    )
     captured: dict[str, ParameterDeclaration] = {}
 
     def capture(_node: Any, declarations: Iterable[ParameterDeclaration]) -> None:
@@ -201,7 +206,7 @@ def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Parame
     monkeypatch.setattr(Node, "__init__", lambda *_args, **_kwargs: None)
     monkeypatch.setattr(base, "Parameters", capture)
     with pytest.raises(_Captured):
-        getattr(module, kind)()
+        kind()
     return captured
 
 

@@ -32,8 +32,6 @@ from semcal_ros.core.errors import MicroscopeError
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import latched
 
-__all__ = ["MicroscopeCommands"]
-
 # Stages turn by some degrees per second; nothing that is asked for here is farther than a full turn.
 _ANSWER_S = 120.0
 # The middleware finds a node that runs within a second or two.

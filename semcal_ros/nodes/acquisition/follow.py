@@ -35,8 +35,6 @@ from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 
-__all__ = ["GridFinder", "GridFollower"]
-
 # Moves to bring a grid to the middle: what is seen of it at first may be a corner only.
 _MOST_MOVES = 6
 # A move after which it is off by more than this part of what it was has gone the wrong way.

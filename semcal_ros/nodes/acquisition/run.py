@@ -44,18 +44,6 @@ from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 from semcal_ros.nodes.acquisition.follow import GridFinder, GridFollower, Posture
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 
-__all__ = [
-    "ACQUISITION",
-    "AWAY",
-    "AcquisitionRun",
-    "Progress",
-    "Run",
-    "Taker",
-    "ViewTaker",
-    "describe_request",
-    "goal_of",
-]
-
 ACQUISITION = (
     ParameterDeclaration(
         "microscope",

@@ -50,8 +50,6 @@ from semcal_ros.nodes.common.parameters import (
 )
 from semcal_ros.nodes.common.reporter import Reporter
 
-__all__ = ["DEFAULT_NAMESPACE", "SemNode"]
-
 DEFAULT_NAMESPACE = "sem"
 """Namespace of a node that is started without one. All topics have relative names, and the nodes of one microscope
 find each other in one namespace; `-r __ns:=/lab/sem` or the argument `namespace` of the launch files changes it."""

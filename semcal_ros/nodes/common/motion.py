@@ -37,8 +37,6 @@ from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import stream_output
 
-__all__ = ["MOTION", "MotionInterface", "Performer", "motion_with"]
-
 # Least, greatest and longest step of each joint. Stages of SEMs tilt from some degrees below 0 to 60 or more; a
 # specimen that is higher than another touches the pole piece on its way up, so that z is locked unless someone says how
 # far it may go. One command turns and tilts little enough to be watched and stopped.

@@ -44,8 +44,6 @@ from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node without drift does not
     from semcal_ros.nodes.frames.live_drift import FrameDrift
 
-__all__ = ["CalibratedStreamNode"]
-
 _WITHOUT_CAMERA = (
     ParameterDeclaration(
         "uncalibrated",

@@ -42,8 +42,6 @@ from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
-__all__ = ["CalibrationInput", "calibration_digest", "report_scale_warnings"]
-
 _TOPIC = "topic"
 # Largest accepted difference between the middleware's clock and that of this process.
 _CLOCK_STEP_NS = 1_000_000

@@ -45,8 +45,6 @@ from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.workflows.check_and_update import check_found
 
-__all__ = ["CalibrationMonitor"]
-
 # One check of a hundred calls a valid calibration degraded, and there are thousands of them: so many in a row have to.
 _IN_A_ROW = 2
 # What numerics raise where a view cannot be solved for.
@@ -65,7 +63,7 @@ class _Glimpse:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Examined:
     """A check, or the reason why there is none."""
 
     calibration: Calibration
@@ -73,15 +71,17 @@ class _Seen:
     reason: str = ""
 
 
-def _examine(glimpse: _Glimpse) -> _Seen:
+def _examine(glimpse: _Glimpse) -> _Examined:
     try:
         detection = find_lattice(glimpse.image)
         if isinstance(detection, Rejection):
-            return _Seen(glimpse.calibration, None, f"no grid: {detection.reason}")
+            return _Examined(glimpse.calibration, None, f"no grid: {detection.reason}")
         view = FoundView("view 0", glimpse.magnification, None, detection)
-        return _Seen(glimpse.calibration, check_found(glimpse.calibration, [view], glimpse.config))
+        return _Examined(
+            glimpse.calibration, check_found(glimpse.calibration, [view], glimpse.config)
+        )
     except (SemcalError, *_NUMERIC) as error:
-        return _Seen(glimpse.calibration, None, " ".join(str(error).split()))
+        return _Examined(glimpse.calibration, None, " ".join(str(error).split()))
 
 
 class CalibrationMonitor:
@@ -149,7 +149,7 @@ class CalibrationMonitor:
         self._number += 1
         self._worker.submit(_Glimpse(self._number, grey, g, current, config))
 
-    def _on_seen(self, seen: _Seen) -> None:
+    def _on_seen(self, seen: _Examined) -> None:
         current, _ = self._calibration()
         if seen.calibration is not current:
             return

@@ -35,8 +35,6 @@ from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.frames.stream import StreamFrame
 
-__all__ = ["CompressedOutput", "compressed_parameters"]
-
 
 def compressed_parameters(topic: str) -> tuple[ParameterDeclaration, ...]:
     """Return the parameters of the compressed images of ``topic``, for a node to declare."""

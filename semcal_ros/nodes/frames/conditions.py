@@ -32,8 +32,6 @@ from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.subscription import MessageInfo
 
-__all__ = ["ON_MISMATCH", "ConditionsInput", "ConditionsWatch"]
-
 ON_MISMATCH = ParameterDeclaration(
     "on_mismatch",
     "warn",

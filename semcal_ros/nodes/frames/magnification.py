@@ -34,8 +34,6 @@ from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
-__all__ = ["MagnificationInput"]
-
 # More changes than can precede a late frame: minutes of a knob turned continuously, in 100 KB.
 _KEPT = 4096
 # Smaller steps back are late frames; a replay that restarts steps back by more.

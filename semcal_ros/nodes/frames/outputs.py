@@ -47,8 +47,6 @@ if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node wit
     from semcal_ros.core.drift.estimates import DriftUpdate
     from semcal_ros.nodes.frames.live_drift import FrameDrift
 
-__all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
-
 
 class ImageOutput:
     """Publishes images on one topic, from memory that is reused for each image, and compressed copies beside it.

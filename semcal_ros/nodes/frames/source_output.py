@@ -36,8 +36,6 @@ from semcal_ros.drivers.source import JOINTS, SourceFrame
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.context import NodeContext
 
-__all__ = ["SourceOutput"]
-
 _ENCODINGS = {"uint8": "mono8", "uint16": "mono16"}
 # The moment of the acquisition that the header stamp means.
 _PASSED = {"start": 0.0, "centre": 0.5, "end": 1.0}

@@ -37,8 +37,6 @@ from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 
-__all__ = ["StageInput"]
-
 # More changes than can precede a late frame.
 _KEPT = 4096
 # Names of joints in a warning, enough to see what there is instead.

@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import math
 import os
+import struct
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,7 +32,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
+from semcal_ros.config.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
@@ -40,21 +42,12 @@ from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
-from semcal_ros.nodes.common.qos import image_input
+from semcal_ros.nodes.common.qos import image_input, stream_output
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.frames.source_timestamps import SourceTimestamps
-
-__all__ = [
-    "FrameInput",
-    "StreamFrame",
-    "StreamNode",
-    "describe_blank_image",
-    "is_late",
-    "nominal_camera",
-]
 
 # The camera stays the same from frame to frame as long as the magnification does.
 nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
@@ -141,6 +134,57 @@ def is_late(waited_s: float, interval_s: float) -> bool:
     The image must have waited for more than 40 ms *and* for more than 1.5 intervals.
     """
     return waited_s > max(_LATE_S, _LATE_INTERVALS * interval_s)
+
+
+# Number of frames: seconds of any stream, longer than another node holds a frame.
+_KEPT = 256
+# Bytes of the encapsulation; after it comes the stamp, with which std_msgs/Header and so every image begins.
+_ENCAPSULATION = 4
+_NS_PER_S = 1_000_000_000  # nanoseconds per second
+
+
+class SourceTimestamps:
+    """Publication times of original frames, by header stamp.
+
+    A magnification without a stamp is matched by the order of publication. A frame that another node made, such as
+    ``image_stabilized``, was published later than its original, perhaps after the next magnification. So this class
+    subscribes to the originals, but reads only their first bytes.
+
+    Parameters
+    ----------
+    endpoints
+        Where to subscribe.
+    source
+        The originals, whose type begins with a header; None if the frames are the originals.
+    """
+
+    def __init__(self, endpoints: Endpoints, source: ImageConfig | None) -> None:
+        self._times: OrderedDict[int, int] = OrderedDict()
+        self._originals = (
+            None
+            if source is None
+            else endpoints.subscribe(
+                message_class(source.type),
+                source.topic,
+                self._on_original,
+                stream_output(10),
+                raw=True,
+            )
+        )
+
+    def _on_original(self, serialized: bytes, info: MessageInfo) -> None:
+        order = "<" if serialized[1] & 1 else ">"
+        seconds, nanoseconds = struct.unpack_from(f"{order}iI", serialized, _ENCAPSULATION)
+        self._times[seconds * _NS_PER_S + nanoseconds] = published_ns(info)
+        while len(self._times) > _KEPT:
+            self._times.popitem(last=False)
+
+    def published_ns(self, stamp_ns: int, info: MessageInfo) -> int:
+        """Return when the original of a frame was published, ns; if it did not arrive, when the frame itself was."""
+        if self._originals is not None:
+            # The frame may be handled before originals that arrived ahead of it.
+            self._originals.take_waiting()
+        return self._times.get(stamp_ns) or published_ns(info)
 
 
 class FrameInput:

@@ -40,8 +40,6 @@ from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, published_ns
 from semcal_ros.viewer.pictures import Outlines, outline
 
-__all__ = ["PolledGroup", "ViewedFrame", "ViewedImages"]
-
 # Raw images that wait for their corrected ones: registration takes some frames in a fast stream.
 _RAW_DEPTH = 4
 _KEPT_RAW = 6

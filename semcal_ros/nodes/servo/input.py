@@ -41,8 +41,6 @@ from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo
 
-__all__ = ["ServoFrame", "ServoInput"]
-
 # Frames that wait for their other parts: more than the queues of all inputs hold. Projections: as many magnifications
 # as can be on their way with those frames.
 _WAITING, _PROJECTIONS = 16, 16
