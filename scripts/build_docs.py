@@ -43,7 +43,7 @@ import click
 
 from semcal_ros import _HOMES  # the public names, with the modules that define them
 from semcal_ros.cli.main import _COMMANDS  # no public name lists them with their summaries
-from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.base import node_class
 from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
 from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import DIRECTORY, ParameterDeclaration
@@ -140,16 +140,9 @@ def parameters_page() -> str:
 
 def _declarations(name: str) -> list[ParameterDeclaration]:
     """As `--help` of the executable shows them: the last declaration of a name counts."""
-    module = import_module(f"semcal_ros.nodes.{name}")
-    (kind,) = (
-        made
-        for made in vars(module).values()
-        if isinstance(made, type) and issubclass(made, SemNode)
-        if made.__module__ == module.__name__
-    )
     try:
         with starting_with(["--help"]):
-            kind()
+            node_class(name)()
     except HelpWanted as wanted:
         found = {declared.name: declared for declared in wanted.declarations}
         if any(declared.confined for declared in found.values()):

@@ -391,6 +391,7 @@ KINDS: dict[str, Kind] = {
     "path": Kind(type=PATH),
     "length": Kind("LENGTH", LENGTH, write=_write_length),
     "length or 0": Kind("LENGTH", LENGTH_OR_ZERO, write=_write_length),
+    "time ahead": Kind("TIME", Quantity("time", "s", "5s or 500ms", within=(0.0, 1e6))),
     "lengths": Kind("LENGTH,...", parse=parse_lengths),
     "ratio": Kind("RATIO", parse=parse_ratio, write=_write_ratio),
     "magnification": Kind("G", parse=parse_magnification),
@@ -406,7 +407,7 @@ KINDS: dict[str, Kind] = {
 }
 
 # Units at the end of a field's name, which the command line does not have: there, a quantity is given with its unit.
-_UNITS = re.compile(r"_(m|px|rad|deg)$")
+_UNITS = re.compile(r"_(m|px|rad|deg|s)$")
 
 
 def _plain_type(hint: Any) -> Any:

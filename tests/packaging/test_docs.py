@@ -190,13 +190,7 @@ class _Captured(Exception):
 
 def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, ParameterDeclaration]:
     """What a node declares, without ROS at work."""
-    module = importlib.import_module(f"semcal_ros.nodes.{node}")
-    (kind,) = (
-        made
-        for made in vars(module).values()
-        if isinstance(made, type) and issubclass(made, base.SemNode)
-        if made.__module__ == module.__name__
-    )
+    kind = base.node_class(node)
     captured: dict[str, ParameterDeclaration] = {}
 
     def capture(_node: Any, declarations: Iterable[ParameterDeclaration]) -> None:

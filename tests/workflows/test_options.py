@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
 import click
@@ -29,9 +29,14 @@ from semcal_ros import calibrate, stack
 from semcal_ros.cli.options import KINDS, given_options, options_of
 from semcal_ros.workflows.calibrate import PAPER_OPTIONS, CalibrateOptions
 from semcal_ros.workflows.calibrate_specimen import SpecimenOptions
+from semcal_ros.workflows.measure_cantilever import CantileverOptions
+from semcal_ros.workflows.measure_relief import ReliefOptions
 from semcal_ros.workflows.options import Keyword, Option, keywords_of, option_fields
+from semcal_ros.workflows.reconstruct import ReconstructOptions
+from semcal_ros.workflows.rectify import RectifyOptions
 from semcal_ros.workflows.simulate import FaultOptions, SimulationOptions
 from semcal_ros.workflows.stack import StackOptions
+from semcal_ros.workflows.track_drift import DriftOptions
 
 
 @dataclass(frozen=True)
@@ -129,11 +134,15 @@ def test_its_docstring_says_what_they_mean_before_the_other_sections() -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", [StackOptions, CalibrateOptions, SpecimenOptions, SimulationOptions, FaultOptions]
+    "kind",
+    [
+        *(CalibrateOptions, CantileverOptions, DriftOptions, FaultOptions, ReconstructOptions),
+        *(RectifyOptions, ReliefOptions, SimulationOptions, SpecimenOptions, StackOptions),
+    ],
 )
 def test_every_field_of_the_package_has_a_meaning_and_a_known_kind(kind: type) -> None:
     described = option_fields(kind)
-    assert {one.name for one in described} == set(kind.__dataclass_fields__)  # type: ignore[attr-defined]
+    assert [one.name for one in described] == [field.name for field in fields(kind)]
     for one in described:
         assert one.meaning.text.strip()
         if isinstance(one.meaning, Option):

@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib import import_module
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
@@ -228,3 +229,15 @@ class SemNode(Node):
         array.header.stamp = self.get_clock().now().to_msg()
         array.status = [self.status()]
         self._diagnostics.publish(array)
+
+
+def node_class(executable: str) -> type[SemNode]:
+    """Return the class of the node that an executable runs."""
+    module = import_module(f"semcal_ros.nodes.{executable}")
+    (kind,) = (
+        made
+        for made in vars(module).values()
+        if isinstance(made, type) and issubclass(made, SemNode)
+        if made.__module__ == module.__name__
+    )
+    return kind
