@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the calibration server knows: views, a calibration that runs, an acquisition; no ROS, no files, no threads.
+"""What the calibration server knows: views, a calibration that runs, an acquisition; no ROS and no files.
 
 Each event is a method of the frozen :class:`CalibrationState`: it returns the next state, with what is to be done, or
 refuses by an error and changes nothing. :mod:`semcal_ros.nodes.calibration_server` reads messages, calls these
@@ -21,11 +21,12 @@ methods one at a time, does what they say, and publishes.
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,8 @@ from semcal_ros.workflows.provenance import describe_views
 if TYPE_CHECKING:  # what they move the microscope with needs ROS
     from semcal_ros.nodes.acquisition.ladder import LadderRun
     from semcal_ros.nodes.acquisition.run import AcquisitionRun
+
+Answer = TypeVar("Answer")
 
 # Stamps that are behind by more are of another clock, or of so slow a scan that one follows the other.
 _OTHER_CLOCK_NS = 30 * 10**9
@@ -513,3 +516,30 @@ class CalibrationState:
             values += [("left_out", str(progress.left_out))]
             values += [("largest_sigma", f"{progress.largest:.3g}")]
         return tuple(values)
+
+
+class CurrentState:
+    """The state of now, for several threads: one event at a time."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._now = CalibrationState()
+
+    @property
+    def now(self) -> CalibrationState:
+        """The state; it is frozen, and may be an old one at once."""
+        return self._now
+
+    def change(self, event: Callable[[CalibrationState], CalibrationState]) -> CalibrationState:
+        """Go on to the state that an event leads to, and return it; a refusal leaves it as it is."""
+        with self._lock:
+            self._now = event(self._now)
+            return self._now
+
+    def answer(
+        self, event: Callable[[CalibrationState], tuple[CalibrationState, Answer]]
+    ) -> Answer:
+        """As :meth:`change`, for an event that also answers; return the answer."""
+        with self._lock:
+            self._now, answer = event(self._now)
+            return answer
