@@ -26,8 +26,7 @@ import click
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.extend_command import echo_pairs, echo_steps
-from semcal_ros.cli.grid_options import refuse_grid_options
-from semcal_ros.cli.options import options_of, refuse_with
+from semcal_ros.cli.options import options_of, refuse_grid_options, refuse_with
 from semcal_ros.cli.output import (
     echo_notes,
     echo_rejected,

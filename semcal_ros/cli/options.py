@@ -253,6 +253,29 @@ def given_options() -> list[str]:
     ]
 
 
+def refuse_grid_options(why: str) -> None:
+    """Refuse the first of these options that the user gave, for work that looks at no grid.
+
+    Parameters
+    ----------
+    why
+        What the work looks at instead, with the option that asked for it.
+
+    Raises
+    ------
+    InvalidValueError
+        If one was given, even with the value of its default.
+    """
+    given = given_options()
+    for name in ("--squares", "--pattern", "--untilted"):
+        if name in given:
+            raise InvalidValueError(
+                f"{name}, which is about a grid; {why}",
+                expected="one of the two",
+                do=f"leave out {name}",
+            )
+
+
 # -- options from dataclasses -------------------------------------------------------------------------
 
 

@@ -85,8 +85,8 @@ from semcal_ros.workflows.options import (
     PROGRESS,
     SQUARES,
     Keyword,
+    KeywordsOf,
     Option,
-    keywords_of,
 )
 from semcal_ros.workflows.provenance import (
     describe_computation,
@@ -504,7 +504,7 @@ def calibrate_recording(
     )
 
 
-@keywords_of(CalibrateOptions)
+@KeywordsOf(CalibrateOptions)
 def calibrate(source: Source, asked: CalibrateOptions) -> Calibration:
     """Calibrate a microscope from a recording or from images in memory.
 

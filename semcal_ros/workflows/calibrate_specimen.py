@@ -40,7 +40,7 @@ from semcal_ros.workflows.inputs import (
     ignore_progress,
     resolve_config,
 )
-from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, Option, keywords_of
+from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, KeywordsOf, Option
 from semcal_ros.workflows.provenance import describe_provenance
 
 #: Relative 1-sigma of a size that is stated without one: what a microscope that was serviced shows.
@@ -104,7 +104,7 @@ class SpecimenOptions:
     on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
 
 
-@keywords_of(SpecimenOptions)
+@KeywordsOf(SpecimenOptions)
 def calibrate_specimen(source: Source, options: SpecimenOptions) -> RecordedSpecimenCalibration:
     """Calibrate from pictures of a flat, textured specimen, without a grid.
 

@@ -57,6 +57,10 @@ PATTERN = Option(
     choices=PATTERNS,
     python="Of all but chess boards, ``squares_m`` is the distance from one to the next.",
 )
+# Of a grid that a calibration is compared with.
+PATTERN_AGAIN = replace(
+    PATTERN, python='``"auto"`` is a grating where the calibration was made with one.'
+)
 UNTILTED = Option(
     "Frames without tilt, by number or by file name, if no stage says the tilts.",
     kind="untilted",

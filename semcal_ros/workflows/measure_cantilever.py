@@ -61,8 +61,8 @@ from semcal_ros.workflows.options import (
     MAGNIFICATION,
     PROGRESS,
     Keyword,
+    KeywordsOf,
     Option,
-    keywords_of,
 )
 
 #: Columns of the table of ``semcal measure cantilever``.
@@ -224,7 +224,7 @@ class CantileverOptions:
     ] = ignore_progress
 
 
-@keywords_of(CantileverOptions)
+@KeywordsOf(CantileverOptions)
 def measure_cantilever(
     source: Source | Sequence[str | os.PathLike[str] | RecordedFiles], options: CantileverOptions
 ) -> CantileverMeasurement:

@@ -44,7 +44,7 @@ from semcal_ros.workflows.inputs import (
     resolve_calibration,
     resolve_config,
 )
-from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, Option, keywords_of
+from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, KeywordsOf, Option
 
 #: Suffixes of what a relief is written to: a height map, a cloud of points, tables of points.
 RELIEF_SUFFIXES = (*TIFF_SUFFIXES, ".ply", *TABLE_SUFFIXES)
@@ -170,7 +170,7 @@ class ReliefOptions:
     on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
 
 
-@keywords_of(ReliefOptions)
+@KeywordsOf(ReliefOptions)
 def measure_relief(source: Source, options: ReliefOptions) -> Relief:
     """Measure the relief of a specimen in two or three tilted pictures.
 

@@ -14,7 +14,7 @@
 
 """One declaration for each option: a field of a frozen dataclass, with its type, its default and what it means.
 
-The function of the package takes the fields as keywords (:func:`keywords_of`), with their meaning in its docstring; the
+The function of the package takes the fields as keywords (:class:`KeywordsOf`), with their meaning in its docstring; the
 command takes them as options (:func:`semcal_ros.cli.options.options_of`); the page on the command line has its tables
 from those.
 """
@@ -29,16 +29,19 @@ from typing import (
     Annotated,
     Any,
     Concatenate,
+    Generic,
     ParamSpec,
     TypeVar,
     cast,
     get_args,
     get_origin,
     get_type_hints,
+    overload,
 )
 
 Given = ParamSpec("Given")
 Options = TypeVar("Options")
+First = TypeVar("First")
 Source = TypeVar("Source")
 Result = TypeVar("Result")
 
@@ -160,50 +163,65 @@ def option_fields(kind: type, meanings: Mapping[str, Keyword] | None = None) -> 
     return found
 
 
-def keywords_of(
-    options: Callable[Given, Options],
-) -> Callable[[Callable[[Source, Options], Result]], Callable[Concatenate[Source, Given], Result]]:
-    """Let a function of something and a dataclass of options take the fields of the dataclass as its keywords.
+class KeywordsOf(Generic[Given, Options]):
+    """Lets a function of one or two things and a dataclass of options take the fields of the dataclass as keywords.
 
-    Its docstring gets a list of the keywords and what they mean; the dataclass is its attribute ``options``.
+    The docstring of the function gets a list of the keywords and what they mean; the dataclass is its attribute
+    ``options``.
+
+    Parameters
+    ----------
+    options
+        The dataclass.
 
     Examples
     --------
     >>> @dataclass(frozen=True)
     ... class HowOften:
     ...     times: Annotated[int, Keyword("How often.")] = 1
-    >>> @keywords_of(HowOften)
+    >>> @KeywordsOf(HowOften)
     ... def say(text: str, options: HowOften) -> str:
     ...     return options.times * text
     >>> say("ho", times=3)
     'hohoho'
     """
 
-    def decorate(
-        function: Callable[[Source, Options], Result],
-    ) -> Callable[Concatenate[Source, Given], Result]:
-        described = option_fields(cast(type, options))
+    def __init__(self, options: Callable[Given, Options]) -> None:
+        self._options = options
+
+    @overload
+    def __call__(
+        self, function: Callable[[Source, Options], Result]
+    ) -> Callable[Concatenate[Source, Given], Result]: ...
+
+    @overload
+    def __call__(
+        self, function: Callable[[First, Source, Options], Result]
+    ) -> Callable[Concatenate[First, Source, Given], Result]: ...
+
+    def __call__(self, function: Callable[..., Result]) -> Callable[..., Result]:
+        """Return the function with these keywords."""
+        described = option_fields(cast(type, self._options))
         types = {one.name: one.type for one in described}
         own = inspect.signature(function)
-        first, _ = own.parameters.values()
+        *things, _ = own.parameters.values()
         given = [
             parameter.replace(annotation=types.get(name, parameter.annotation))
-            for name, parameter in inspect.signature(options).parameters.items()
+            for name, parameter in inspect.signature(self._options).parameters.items()
         ]
-        signature = own.replace(parameters=[first, *given])
+        signature = own.replace(parameters=[*things, *given])
+        make = cast("Callable[..., Options]", self._options)
 
         @wraps(function)
         def call(*args: Any, **kwargs: Any) -> Result:
             # Here, so that a misspelt keyword is one of this function.
             bound = signature.bind(*args, **kwargs).arguments
-            source = bound.pop(first.name)
-            return function(source, cast("Callable[..., Options]", options)(**bound))
+            leading = [bound.pop(thing.name) for thing in things]
+            return function(*leading, make(**bound))
 
         call.__doc__ = _with_keywords(inspect.getdoc(function) or "", described)
-        vars(call).update(__signature__=signature, options=options)
-        return cast("Callable[Concatenate[Source, Given], Result]", call)
-
-    return decorate
+        vars(call).update(__signature__=signature, options=self._options)
+        return call
 
 
 def _with_keywords(text: str, described: list[OptionField]) -> str:

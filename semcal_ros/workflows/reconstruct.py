@@ -51,7 +51,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
-from semcal_ros.workflows.options import CONFIG, DASK, FRAME_TIME, PROGRESS, Option, keywords_of
+from semcal_ros.workflows.options import CONFIG, DASK, FRAME_TIME, PROGRESS, KeywordsOf, Option
 from semcal_ros.workflows.workers import open_workers
 
 # A surface that is seen from outside bulges towards the gun nearly everywhere; its mirror image
@@ -187,7 +187,7 @@ class ReconstructOptions:
     on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
 
 
-@keywords_of(ReconstructOptions)
+@KeywordsOf(ReconstructOptions)
 def reconstruct(source: Source, options: ReconstructOptions) -> Reconstruction:
     """Reconstruct a ball that turns: follow features, adjust points and poses, fit and mesh.
 

@@ -72,8 +72,8 @@ from semcal_ros.workflows.options import (
     INTERPOLATION,
     OVERWRITE,
     PROGRESS,
+    KeywordsOf,
     Option,
-    keywords_of,
 )
 from semcal_ros.workflows.workers import open_workers
 
@@ -177,7 +177,7 @@ class RectifyOptions:
     on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
 
 
-@keywords_of(RectifyOptions)
+@KeywordsOf(RectifyOptions)
 def rectify(source: Source, options: RectifyOptions) -> RectifiedRecording:
     """Undo distortion and drift of each frame in one interpolation.
 

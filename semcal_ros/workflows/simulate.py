@@ -55,7 +55,7 @@ from semcal_ros.workflows.inputs import (
     count_frames,
     ignore_progress,
 )
-from semcal_ros.workflows.options import OVERWRITE, PROGRESS, Keyword, Option, keywords_of
+from semcal_ros.workflows.options import OVERWRITE, PROGRESS, Keyword, KeywordsOf, Option
 
 #: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen beyond the
 #: grid.
@@ -283,7 +283,7 @@ def plan_recording(
     return plan if drift is None else replace(plan, drift=drift_preset(drift))
 
 
-@keywords_of(SimulationOptions)
+@KeywordsOf(SimulationOptions)
 def simulate(output: str | os.PathLike[str], options: SimulationOptions) -> int:
     """Record the virtual SEM to a bag, with ``truth.json`` (SI units) beside it.
 

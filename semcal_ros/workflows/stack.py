@@ -67,8 +67,8 @@ from semcal_ros.workflows.options import (
     INTERPOLATION,
     MAGNIFICATION,
     PROGRESS,
+    KeywordsOf,
     Option,
-    keywords_of,
 )
 from semcal_ros.workflows.select_frames import FrameSelection, select_frames
 from semcal_ros.workflows.workers import open_workers
@@ -277,7 +277,7 @@ class StackOptions:
         return round(self.scan_pairs_deg / 90.0)
 
 
-@keywords_of(StackOptions)
+@KeywordsOf(StackOptions)
 def stack(source: Source, options: StackOptions) -> StackResult:
     """Average frames, each shifted to the specimen's position in the first frame.
 

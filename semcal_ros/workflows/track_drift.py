@@ -49,7 +49,7 @@ from semcal_ros.workflows.inputs import (
     resolve_calibration,
     resolve_config,
 )
-from semcal_ros.workflows.options import CONFIG, FRAME_TIME, PROGRESS, Option, keywords_of
+from semcal_ros.workflows.options import CONFIG, FRAME_TIME, PROGRESS, KeywordsOf, Option
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class DriftOptions:
     on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
 
 
-@keywords_of(DriftOptions)
+@KeywordsOf(DriftOptions)
 def track_drift(source: Source, options: DriftOptions) -> DriftTrack:
     """Measure the drift of the specimen at the centre of each frame, relative to the first one.
 

@@ -29,9 +29,11 @@ from semcal_ros import calibrate, stack
 from semcal_ros.cli.options import KINDS, given_options, options_of
 from semcal_ros.workflows.calibrate import PAPER_OPTIONS, CalibrateOptions
 from semcal_ros.workflows.calibrate_specimen import SpecimenOptions
+from semcal_ros.workflows.check_and_update import CheckOptions, UpdateOptions
+from semcal_ros.workflows.evaluate import EvaluateOptions
 from semcal_ros.workflows.measure_cantilever import CantileverOptions
 from semcal_ros.workflows.measure_relief import ReliefOptions
-from semcal_ros.workflows.options import Keyword, Option, keywords_of, option_fields
+from semcal_ros.workflows.options import Keyword, KeywordsOf, Option, option_fields
 from semcal_ros.workflows.reconstruct import ReconstructOptions
 from semcal_ros.workflows.rectify import RectifyOptions
 from semcal_ros.workflows.simulate import FaultOptions, SimulationOptions
@@ -56,7 +58,7 @@ class Sample:
     unsaid: int = 0
 
 
-@keywords_of(Sample)
+@KeywordsOf(Sample)
 def measure(source: str, options: Sample) -> tuple[str, Sample]:
     """Measure something.
 
@@ -126,6 +128,15 @@ def test_a_function_takes_the_fields_as_keywords() -> None:
     assert inspect.signature(measure).parameters["bits"].annotation is int
 
 
+def test_two_things_may_come_first() -> None:
+    @KeywordsOf(Sample)
+    def compare(first: str, second: str, options: Sample) -> tuple[str, str, int]:
+        return first, second, options.bits
+
+    assert compare("a", "b", bits=16) == ("a", "b", 16)
+    assert list(inspect.signature(compare).parameters)[:3] == ["first", "second", "count"]
+
+
 def test_its_docstring_says_what_they_mean_before_the_other_sections() -> None:
     text = measure.__doc__ or ""
     assert "count\n    How many. At most nine.\n" in text
@@ -136,7 +147,8 @@ def test_its_docstring_says_what_they_mean_before_the_other_sections() -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        *(CalibrateOptions, CantileverOptions, DriftOptions, FaultOptions, ReconstructOptions),
+        *(CalibrateOptions, CantileverOptions, CheckOptions, DriftOptions, EvaluateOptions),
+        *(FaultOptions, ReconstructOptions, UpdateOptions),
         *(RectifyOptions, ReliefOptions, SimulationOptions, SpecimenOptions, StackOptions),
     ],
 )
