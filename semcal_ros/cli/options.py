@@ -30,7 +30,6 @@ import click
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tiff.values import angle_in_degrees, plain_number, quantity
 from semcal_ros.workflows.options import (
-    DASK,
     OVERWRITE,
     SQUARES,
     Keyword,
@@ -510,5 +509,4 @@ def options_of(
     return decorate
 
 
-dask_option = make_option(OptionField("dask", str | None, None, DASK))
 overwrite_option = make_option(OptionField("overwrite", bool, False, OVERWRITE))
