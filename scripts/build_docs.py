@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import ast
 import base64
+import dataclasses
 import fcntl
 import hashlib
 import json
@@ -42,9 +43,11 @@ import click
 
 from semcal_ros import _HOMES  # the public names, with the modules that define them
 from semcal_ros.cli.main import _COMMANDS  # no public name lists them with their summaries
+from semcal_ros.nodes.common.base import node_class
 from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
 from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import DIRECTORY, ParameterDeclaration
+from semcal_ros.workflows.options import OptionField, option_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "semcal_ros"
@@ -59,7 +62,16 @@ _SENTENCE = re.compile(r"(?=(?:.*?\b[a-z]{2,}\b){2})[^<>{}\\=_$|]*\s[^<>{}\\=_$|
 _FINDINGS = ("ok", "note", "problem")
 # Their texts are in the other generated pages, or are none.
 _NOT_SHOWN = (
-    *("option", "argument", "command", "group", "Option", "Argument", "ParameterDeclaration"),
+    *(
+        "option",
+        "argument",
+        "command",
+        "group",
+        "Option",
+        "Keyword",
+        "Argument",
+        "ParameterDeclaration",
+    ),
     *("add_argument", "compile", "Executable", "Field", "deprecated", "warn_deprecated"),
 )
 # Who says what is not an error, by the rooms of the package.
@@ -128,11 +140,9 @@ def parameters_page() -> str:
 
 def _declarations(name: str) -> list[ParameterDeclaration]:
     """As `--help` of the executable shows them: the last declaration of a name counts."""
-    module = import_module(f"semcal_ros.nodes.{name}")
-    (kind,) = (public for public in module.__all__ if public != "main")
     try:
         with starting_with(["--help"]):
-            getattr(module, kind)()
+            node_class(name)()
     except HelpWanted as wanted:
         found = {declared.name: declared for declared in wanted.declarations}
         if any(declared.confined for declared in found.values()):
@@ -154,7 +164,20 @@ def api_page() -> str:
     parts += ["Generated from the docstrings. With examples: [From Python](../python.md).", ""]
     for name, home in _HOMES.items():
         parts += [f"::: {home}.{name}", ""]
+        # Which the source of the function does not show.
+        options = getattr(getattr(import_module(home), name), "options", None)
+        if options is not None:
+            parts += ["| keyword | default | |", "|---|---|---|"]
+            parts += [_keyword_row(field) for field in option_fields(options)]
+            parts.append("")
     return "\n".join(parts)
+
+
+def _keyword_row(field: OptionField) -> str:
+    default = "" if field.default is dataclasses.MISSING else f"`{field.default!r}`"
+    if callable(field.default):
+        default = ""
+    return f"| `{field.name}` | {_cell(default)} | {_cell(field.meaning.in_python.replace('``', '`'))} |"
 
 
 def without_sphinx(html: str) -> str:

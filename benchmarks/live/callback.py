@@ -219,9 +219,10 @@ def node_actions(
     turn(rectifier, MAGNIFICATION)
     turn(corrector, MAGNIFICATION)
     frame(corrector)
-    known = corrector._drift._latest.update
+    known = corrector.correction.tracking._latest.update
     camera = calibration().at(MAGNIFICATION).resized(size, size)
-    tracker, corrector._drift = corrector._drift, KnownDrift(corrector._drift, known, camera)
+    tracker = corrector.correction.tracking
+    corrector.correction.tracking = KnownDrift(tracker, known, camera)
 
     def registration() -> None:
         clock["ns"] += 100_000_000

@@ -18,39 +18,19 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import (
-    PATH,
-    config_option,
-    output_option,
-    parse_magnification,
-    parse_ratio,
-    parse_tilts,
-    refuse_with,
-    require_folder,
-)
+from semcal_ros.cli.options import config_option, options_of, refuse_with, require_folder
 from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.acquisition import MOST_VIEWS
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.ladder.plan import plan_ladder
-
-__all__ = ["command"]
-
-
-def _parse_range(
-    _context: click.Context, _parameter: click.Parameter, text: str | None
-) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        low, high = (float(part) for part in text.split(","))
-    except ValueError:
-        raise click.BadParameter(f"{text!r} is not a range such as 500,10000") from None
-    return low, high
+from semcal_ros.workflows.options import Option
 
 
 def _wait_for_enter(text: str) -> None:
@@ -59,98 +39,144 @@ def _wait_for_enter(text: str) -> None:
         raise SemcalError("the input has ended", expected="Enter after each view")
 
 
+@dataclass(frozen=True)
+class AcquisitionOptions:
+    """What is to be reached, by what, and what is kept of it."""
+
+    output: Annotated[
+        Path, Option("Calibration file.", kind="path", names=("-o", "--output"), required=True)
+    ]
+    magnifications: Annotated[
+        tuple[float, float] | None,
+        Option("Magnifications to calibrate by a grid.", kind="range", names=("--range",)),
+    ] = None
+    extended: Annotated[
+        Path | None,
+        Option(
+            "Instead: extend this calibration by a ladder of magnifications over a specimen.",
+            kind="path",
+            names=("--extend",),
+            metavar="CALIBRATION",
+        ),
+    ] = None
+    last: Annotated[
+        float | None,
+        Option(
+            "Magnification that --extend reaches, such as 100000x.",
+            kind="magnification",
+            names=("--to",),
+        ),
+    ] = None
+    target: Annotated[
+        float,
+        Option(
+            "1-sigma of nm per pixel to reach, repeatability of the magnification aside.",
+            kind="ratio",
+        ),
+    ] = 1e-3
+    microscope: Annotated[
+        str, Option("Node that moves the microscope, such as virtual_sem.", metavar="TEXT")
+    ] = "microscope"
+    by_hand: Annotated[bool, Option("Say what to set, and wait for Enter; nothing is moved.")] = (
+        False
+    )
+    tilts: Annotated[
+        tuple[float, ...],
+        Option("Tilts of each visit; a bare number is in degrees.", kind="tilts"),
+    ] = (0.0, math.radians(20.0), math.radians(40.0))
+    turn_by: Annotated[
+        str,
+        Option(
+            "What turns the grid in the image between views, or a ladder's last picture.",
+            choices=("scan_rotation", "rotation", "nothing"),
+        ),
+    ] = "scan_rotation"
+    most_views: Annotated[
+        int, Option("End after so many views, with the target met or not.", between=(6, 1000))
+    ] = MOST_VIEWS
+    record: Annotated[
+        Path | None,
+        Option(
+            "Recording of all pictures, a new folder. [default: named after the calibration file]",
+            kind="path",
+        ),
+    ] = None
+    no_record: Annotated[bool, Option("Record nothing; it cannot be gone on with then.")] = False
+    resume: Annotated[
+        Path | None,
+        Option(
+            "Go on with an interrupted acquisition: take over the views of its recording.",
+            kind="path",
+        ),
+    ] = None
+    namespace: Annotated[str, Option("Of the nodes and topics.")] = "/sem"
+
+    def check(self) -> None:
+        """Refuse options that contradict each other; raises :class:`InvalidValueError`."""
+        extended, last, record, resume = self.extended, self.last, self.record, self.resume
+        if (self.magnifications is None) == (extended is None):
+            raise InvalidValueError(
+                "neither --range nor --extend" if extended is None else "--range and --extend",
+                expected="one of the two",
+            )
+        if (extended is None) != (last is None):
+            raise InvalidValueError(
+                "--to without --extend" if extended is None else "--extend without --to",
+                expected="both, such as --extend cal.yaml --to 100000x",
+            )
+        if extended is not None and last is not None:
+            refuse_with(
+                "--extend", "which looks at no grid", ("--target", "--tilts", "--most-views")
+            )
+            # What is wrong is said before anything is started.
+            plan_ladder(Calibration.load(extended), last)
+        require_folder(self.output)
+        if record is not None and self.no_record:
+            raise InvalidValueError("--record and --no-record", expected="one of them")
+        if record is not None and record.exists():
+            raise InvalidValueError(f"--record {record} exists", expected="a new folder")
+        if resume is not None and not resume.exists():
+            raise InvalidValueError(
+                f"--resume {resume} does not exist",
+                expected="the recording of an interrupted acquisition",
+            )
+        if not self.namespace.startswith("/"):
+            raise InvalidValueError(
+                f"--namespace {self.namespace}", expected="a name that begins with /"
+            )
+
+    def node_parameters(self, config: str) -> dict[str, object]:
+        """Return the parameters of the node ``calibration_server`` that say the same."""
+        parameters: dict[str, object] = {
+            "config": config,
+            "output": str(self.output.absolute()),
+            "turn_by": self.turn_by,
+        }
+        if self.magnifications is not None:
+            parameters |= {
+                "lowest_magnification": self.magnifications[0],
+                "highest_magnification": self.magnifications[1],
+                "target": self.target,
+                "tilts_deg": f"'{','.join(f'{math.degrees(tilt):.12g}' for tilt in self.tilts)}'",
+                "most_views": self.most_views,
+            }
+        if self.extended is not None and self.last is not None:
+            parameters |= {"calibration": str(self.extended.absolute()), "extend_to": self.last}
+        if not self.by_hand:
+            parameters["microscope"] = self.microscope
+        # The node adds a number if there is one already.
+        record = self.record or self.output.with_name(f"{self.output.stem}_views")
+        if not self.no_record:
+            parameters["record"] = str(record.absolute())
+        if self.resume is not None:
+            parameters["resume"] = str(self.resume.absolute())
+        return parameters
+
+
 @click.command("acquire")
-@output_option("Calibration file.")
-@click.option(
-    "--range",
-    "magnifications",
-    callback=_parse_range,
-    metavar="LOW,HIGH",
-    help="Magnifications to calibrate by a grid.",
-)
-@click.option(
-    "--extend",
-    "extended",
-    type=PATH,
-    metavar="CALIBRATION",
-    help="Instead: extend this calibration by a ladder of magnifications over a specimen.",
-)
-@click.option(
-    "--to",
-    "last",
-    callback=parse_magnification,
-    metavar="G",
-    help="Magnification that --extend reaches, such as 100000x.",
-)
-@click.option(
-    "--target",
-    default="0.1%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="1-sigma of nm per pixel to reach, repeatability of the magnification aside.",
-)
-@click.option(
-    "--microscope",
-    default="microscope",
-    show_default=True,
-    help="Node that moves the microscope, such as virtual_sem.",
-)
-@click.option(
-    "--by-hand", is_flag=True, help="Say what to set, and wait for Enter; nothing is moved."
-)
-@click.option(
-    "--tilts",
-    default="0deg,20deg,40deg",
-    show_default=True,
-    callback=parse_tilts,
-    metavar="ANGLE,...",
-    help="Tilts of each visit; a bare number is in degrees.",
-)
-@click.option(
-    "--turn-by",
-    type=click.Choice(["scan_rotation", "rotation", "nothing"]),
-    default="scan_rotation",
-    show_default=True,
-    help="What turns the grid in the image between views, or a ladder's last picture.",
-)
-@click.option(
-    "--most-views",
-    type=click.IntRange(6, 1000),
-    default=MOST_VIEWS,
-    show_default=True,
-    help="End after so many views, with the target met or not.",
-)
-@click.option(
-    "--record",
-    type=PATH,
-    help="Recording of all pictures, a new folder. [default: named after the calibration file]",
-)
-@click.option("--no-record", is_flag=True, help="Record nothing; it cannot be gone on with then.")
-@click.option(
-    "--resume",
-    type=PATH,
-    help="Go on with an interrupted acquisition: take over the views of its recording.",
-)
-@click.option("--namespace", default="/sem", show_default=True, help="Of the nodes and topics.")
+@options_of(AcquisitionOptions)
 @config_option
-def command(
-    output: Path,
-    magnifications: tuple[float, float] | None,
-    extended: Path | None,
-    last: float | None,
-    target: float,
-    microscope: str,
-    by_hand: bool,
-    tilts: tuple[float, ...],
-    turn_by: str,
-    most_views: int,
-    record: Path | None,
-    no_record: bool,
-    resume: Path | None,
-    namespace: str,
-    config: str,
-) -> None:
+def command(options: AcquisitionOptions, config: str) -> None:
     """Calibrate a live microscope unattended: move it, take views of the grid, until nm per pixel is certain enough.
 
     Or extend a calibration: move over a flat, textured specimen, from inside the calibrated range to --to.
@@ -166,36 +192,8 @@ def command(
       semcal acquire -o cal.yaml --range 500,10000 --by-hand
       semcal acquire -o cal_20kx.yaml --extend cal.yaml --to 20000x --microscope virtual_sem --config virtual_sem
     """
-    if (magnifications is None) == (extended is None):
-        raise InvalidValueError(
-            "neither --range nor --extend" if extended is None else "--range and --extend",
-            expected="one of the two",
-        )
-    if (extended is None) != (last is None):
-        raise InvalidValueError(
-            "--to without --extend" if extended is None else "--extend without --to",
-            expected="both, such as --extend cal.yaml --to 100000x",
-        )
-    if extended is not None and last is not None:
-        refuse_with("--extend", "which looks at no grid", ("target", "tilts", "most_views"))
-        # What is wrong is said before anything is started.
-        plan_ladder(Calibration.load(extended), last)
-    require_folder(output)
+    options.check()
     load_config(config)
-    if record is not None and no_record:
-        raise InvalidValueError("--record and --no-record", expected="one of them")
-    if record is not None and record.exists():
-        raise InvalidValueError(f"--record {record} exists", expected="a new folder")
-    if resume is not None and not resume.exists():
-        raise InvalidValueError(
-            f"--resume {resume} does not exist",
-            expected="the recording of an interrupted acquisition",
-        )
-    if record is None and not no_record:
-        # The node adds a number if there is one already.
-        record = output.with_name(f"{output.stem}_views")
-    if not namespace.startswith("/"):
-        raise InvalidValueError(f"--namespace {namespace}", expected="a name that begins with /")
     try:
         from semcal_ros.nodes.acquire import run_acquisition
     except ImportError as error:
@@ -204,28 +202,7 @@ def command(
             expected="rclpy for a live microscope",
             do="source a ROS 2 workspace or run `make setup`",
         ) from error
-    parameters: dict[str, object] = {
-        "config": config,
-        "output": str(output.absolute()),
-        "turn_by": turn_by,
-    }
-    if magnifications is not None:
-        parameters |= {
-            "lowest_magnification": magnifications[0],
-            "highest_magnification": magnifications[1],
-            "target": target,
-            "tilts_deg": f"'{','.join(f'{math.degrees(tilt):.12g}' for tilt in tilts)}'",
-            "most_views": most_views,
-        }
-    if extended is not None and last is not None:
-        parameters |= {"calibration": str(extended.absolute()), "extend_to": last}
-    if not by_hand:
-        parameters["microscope"] = microscope
-    if record is not None:
-        parameters["record"] = str(record.absolute())
-    if resume is not None:
-        parameters["resume"] = str(resume.absolute())
-    arguments = ["--ros-args", "-r", f"__ns:={namespace}", "--log-level", "error"]
-    for name, value in parameters.items():
+    arguments = ["--ros-args", "-r", f"__ns:={options.namespace}", "--log-level", "error"]
+    for name, value in options.node_parameters(config).items():
         arguments += ["-p", f"{name}:={value}"]
     sys.exit(run_acquisition(arguments, click.echo, _wait_for_enter))

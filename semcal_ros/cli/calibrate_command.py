@@ -18,23 +18,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.extend_command import echo_pairs, echo_steps
-from semcal_ros.cli.grid_options import grid_options, refuse_grid_options
-from semcal_ros.cli.options import (
-    LENGTH,
-    LENGTH_OR_ZERO,
-    PATH,
-    dask_option,
-    output_option,
-    parse_ratio,
-    refuse_with,
-)
+from semcal_ros.cli.options import options_of, refuse_grid_options, refuse_with
 from semcal_ros.cli.output import (
     echo_notes,
     echo_rejected,
@@ -45,105 +37,65 @@ from semcal_ros.cli.output import (
 )
 from semcal_ros.cli.recording_input import PIXEL_SIZE_AT, check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.calibration.options import (
-    METHODS,
-    RESIDUAL_MODES,
-    CalibrationOptions,
-    MethodOptions,
-)
+from semcal_ros.core.calibration.options import MethodOptions
 from semcal_ros.core.calibration.paper.pda import focal_length_and_skew, prime
 from semcal_ros.core.corners import PATTERN_NAMES, describe_odds
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted, group_by_kind
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_recording
-from semcal_ros.workflows.calibrate_specimen import calibrate_specimen
-
-__all__ = ["command"]
-
-
-def _parse_magnifications(
-    context: click.Context, parameter: click.Parameter, text: str | None
-) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(",")) if text else ()
-    except ValueError:
-        raise click.BadParameter(f"{text!r} is not a list such as 1000,5000") from None
-
-
-def _parse_step(
-    _context: click.Context, _parameter: click.Parameter, text: str | None
-) -> float | str | None:
-    if text is None or text == "auto":
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise click.BadParameter(f"{text!r} is neither auto nor a number such as 500") from None
-
-
-def _parse_length_in_picture(
-    context: click.Context, parameter: click.Parameter, text: str | None
-) -> tuple[float, ...] | None:
-    """Length in m, number of the picture, and the four coordinates."""
-    if text is None:
-        return None
-    length, _, rest = text.partition("@")
-    try:
-        picture, *ends = (float(part) for part in rest.split(","))
-        if len(ends) != 4 or picture != int(picture):
-            raise ValueError
-    except ValueError:
-        raise click.BadParameter(
-            f"{text!r} is not a length such as 4.2um@0,110,80,300,82"
-        ) from None
-    return (float(LENGTH.convert(length, parameter, context)), picture, *ends)
-
+from semcal_ros.workflows.calibrate import (
+    PAPER_OPTIONS,
+    CalibrateOptions,
+    RecordingCalibration,
+    calibrate_recording,
+)
+from semcal_ros.workflows.calibrate_specimen import SpecimenOptions, calibrate_recorded_specimen
+from semcal_ros.workflows.options import Option
 
 # Options that are about a grid or one of its methods.
 _OF_GRIDS = (
-    "method",
-    "pda_order",
-    "legendre",
-    "pda_step",
-    "breakpoints",
-    "residual",
-    "tau",
-    "squares_sigma",
-    "report",
-    "paper",
-    "dask",
+    "--method",
+    "--pda-order",
+    "--legendre",
+    "--pda-step",
+    "--breakpoints",
+    "--residual",
+    "--tau",
+    "--squares-sigma",
+    "--report",
+    "--paper",
+    "--dask",
 )
 
 
+@dataclass(frozen=True)
+class CalibrateOutputs:
+    """What is written."""
+
+    output: Annotated[
+        Path, Option("Calibration file.", kind="path", names=("-o", "--output"), required=True)
+    ]
+    report: Annotated[Path | None, Option("Also write an HTML report.", kind="path")] = None
+    paper: Annotated[
+        bool, Option("With an appendix in the report that compares with the paper.")
+    ] = False
+
+
 def _calibrate_specimen(
-    recording: RecordedFiles,
-    output: Path,
-    config: MicroscopeConfig,
-    known_length: tuple[float, ...] | None,
-    known_sigma: float,
-    stage_scale: float | None,
+    recording: RecordedFiles, output: Path, config: MicroscopeConfig, known: SpecimenOptions
 ) -> None:
     context = click.get_current_context()
     refuse_grid_options("--specimen looks at a specimen")
     refuse_with("--specimen", "which looks at no grid", _OF_GRIDS)
-    at = context.meta.get(PIXEL_SIZE_AT)
-    missing = [at, known_length, stage_scale].count(None)
+    known = replace(known, pixel_size=context.meta.get(PIXEL_SIZE_AT), config=config)
+    missing = [known.pixel_size, known.length, known.stage_scale].count(None)
     if missing != 2:
         raise InvalidValueError(
             "--specimen without a known size" if missing == 3 else "two known sizes",
             expected="--pixel-size 23.1nm@5000, --length 4.2um@0,110,80,300,82, or --stage-scale 0.5%",
         )
     with show_progress() as on_progress:
-        done = calibrate_specimen(
-            recording,
-            pixel_size=at,
-            length=known_length,
-            sigma=known_sigma,
-            stage_scale=stage_scale,
-            config=config,
-            on_progress=on_progress,
-        )
+        done = calibrate_recorded_specimen(recording, replace(known, on_progress=on_progress))
     done.calibration.save(output)
     echo_verdict(done.calibration)
     echo_steps(done.calibration, done.result.steps)
@@ -156,104 +108,23 @@ def _calibrate_specimen(
 
 @click.command("calibrate")
 @recording_input
-@output_option("Calibration file.")
-@grid_options
-@click.option("--method", type=click.Choice(METHODS), default="joint", show_default=True)
-@click.option("--pda-order", type=click.IntRange(1, 4), default=2, show_default=True)
-@click.option(
-    "--legendre",
-    type=click.IntRange(0, 20),
-    help="pda: fit Legendre polynomials of this degree instead of an ODE.",
-)
-@click.option(
-    "--pda-step",
-    callback=_parse_step,
-    metavar="auto|G",
-    help="pda: fit through magnifications G apart; auto tries all steps and takes that of the least error.",
-)
-@click.option(
-    "--breakpoints",
-    callback=_parse_magnifications,
-    metavar="G,G,...",
-    help="joint: where the microscope switches its scan range, so that the scale jumps.",
-)
-@click.option(
-    "--residual",
-    type=click.Choice(RESIDUAL_MODES),
-    default="auto",
-    show_default=True,
-    help="joint: whether to add a field for what the distortion parameters cannot describe.",
-)
-@click.option(
-    "--tau", type=float, help="Algorithm 1: fixed threshold in px instead of a statistical test."
-)
-@click.option(
-    "--squares-sigma",
-    type=click.FloatRange(0.0, 0.1),
-    help="Relative 1-sigma of the grid's squares, such as 0.001, instead of that of the configuration.",
-)
-@click.option(
-    "--height-sigma",
-    type=LENGTH_OR_ZERO,
-    default=f"{CalibrationOptions.height_sigma_m * 1e6:g}um",
-    show_default=True,
-    metavar="LENGTH",
-    help="1-sigma of the height of what is measured later above or below the untilted grid.",
-)
+@options_of(CalibrateOutputs, "outputs")
+@options_of(CalibrateOptions)
+@options_of(MethodOptions, "paper_options", PAPER_OPTIONS)
 @click.option(
     "--specimen",
     is_flag=True,
     help="Without a grid: moved, turned and zoomed pictures of a flat, textured specimen, and one known size.",
 )
-@click.option(
-    "--length",
-    "known_length",
-    callback=_parse_length_in_picture,
-    metavar="LENGTH@N,X,Y,X,Y",
-    help="--specimen: a known length, such as 4.2um@0,110,80,300,82: in picture 0, from pixel 110,80 to 300,82.",
-)
-@click.option(
-    "--known-sigma",
-    callback=parse_ratio,
-    default="1%",
-    show_default=True,
-    metavar="RATIO",
-    help="--specimen: 1-sigma of the known pixel size or length.",
-)
-@click.option(
-    "--stage-scale",
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="--specimen: the moves of the stage are the known lengths, with this 1-sigma, such as 0.5%.",
-)
-@click.option("--report", type=PATH, help="Also write an HTML report.")
-@click.option(
-    "--paper", is_flag=True, help="With an appendix in the report that compares with the paper."
-)
-@dask_option
+@options_of(SpecimenOptions, "known")
 def command(
     recording: RecordedFiles,
-    output: Path,
     config: MicroscopeConfig,
-    squares: tuple[float, ...] | None,
-    pattern: str,
-    method: str,
-    pda_order: int,
-    legendre: int | None,
-    pda_step: float | str | None,
-    breakpoints: tuple[float, ...],
-    residual: str,
-    untilted: str | tuple[str, ...],
-    squares_sigma: float | None,
-    height_sigma: float,
+    outputs: CalibrateOutputs,
+    options: CalibrateOptions,
+    paper_options: MethodOptions,
     specimen: bool,
-    known_length: tuple[float, ...] | None,
-    known_sigma: float,
-    stage_scale: float | None,
-    tau: float | None,
-    report: Path | None,
-    paper: bool,
-    dask: str | None,
+    known: SpecimenOptions,
 ) -> None:
     """Calibrate from RECORDING: a bag, or a folder of SEM TIFF files or ordinary images, of the grid.
 
@@ -265,40 +136,28 @@ def command(
       semcal calibrate recordings/gold -o cal.yaml --specimen --stage-scale 0.5%
       semcal calibrate recordings/grid -o cal.yaml --method pda --pda-step auto
     """
+    output, report = outputs.output, outputs.report
     check_outputs([("-o", output, ()), ("--report", report, ())])
     if specimen:
-        _calibrate_specimen(recording, output, config, known_length, known_sigma, stage_scale)
+        _calibrate_specimen(recording, output, config, known)
         return
-    for name, value in (("--length", known_length), ("--stage-scale", stage_scale)):
+    for name, value in (("--length", known.length), ("--stage-scale", known.stage_scale)):
         if value is not None:
             raise InvalidValueError(
                 f"{name} without --specimen", expected="both", do="add --specimen"
             )
+    asked = replace(options, config=config, options=paper_options)
     with show_progress() as on_progress:
         done = calibrate_recording(
-            recording,
-            config=config,
-            squares_sigma=squares_sigma,
-            squares_m=squares,
-            options=CalibrationOptions(
-                method,
-                MethodOptions(pda_order, legendre, tau, pda_step),
-                breakpoints,
-                residual,
-                untilted,
-                height_sigma_m=height_sigma,
-            ),
-            pattern=pattern,
-            keep_images=report is not None,
-            dask=dask,
-            on_progress=on_progress,
+            recording, replace(asked, on_progress=on_progress), keep_images=report is not None
         )
     done.calibration.save(output)
     _echo_result(done)
     click.echo(f"calibration: {output}")
     if report is not None:
         with show_progress("writing the report"):
-            _write_report(done, report, f"Calibration from {recording.name}", paper, output)
+            title = f"Calibration from {recording.name}"
+            _write_report(done, report, title, outputs.paper, output)
         click.echo(f"report: {report}")
 
 

@@ -19,14 +19,13 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from semcal_ros.cli.grid_options import grid_options, refuse_grid_options
-from semcal_ros.cli.options import PATH, json_option, parse_ratio
+from semcal_ros.cli.options import PATH, json_option, options_of, parse_ratio, refuse_grid_options
 from semcal_ros.cli.output import (
     echo_json,
     echo_notes,
@@ -40,7 +39,7 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Change, Verdict
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.workflows.check_and_update import check
+from semcal_ros.workflows.check_and_update import CheckOptions, check_recording
 from semcal_ros.workflows.check_specimen import STAGE_ACCURACY, MovesCheck, check_specimen
 
 _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
@@ -49,7 +48,7 @@ _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
 @click.command("check")
 @click.argument("calibration", type=PATH)
 @recording_input
-@grid_options
+@options_of(CheckOptions)
 @click.option(
     "--specimen",
     is_flag=True,
@@ -69,9 +68,7 @@ def command(
     calibration: Path,
     recording: RecordedFiles,
     config: MicroscopeConfig,
-    squares: tuple[float, ...] | None,
-    untilted: str | tuple[str, ...],
-    pattern: str,
+    options: CheckOptions,
     specimen: bool,
     stage_accuracy: float,
     as_json: bool,
@@ -93,14 +90,8 @@ def command(
         _check_specimen(calibration, recording, config, stage_accuracy, as_json=as_json)
         return
     with show_progress() as on_progress:
-        done = check(
-            calibration,
-            recording,
-            config=config,
-            squares_m=squares,
-            untilted=untilted,
-            pattern=pattern,
-            on_progress=on_progress,
+        done = check_recording(
+            calibration, recording, replace(options, config=config, on_progress=on_progress)
         )
     if as_json:
         echo_json(

@@ -69,7 +69,7 @@ def command(port: int, size: int, duration: float | None, browser: bool) -> None
             expected="rclpy",
             do="source a ROS 2 workspace or run `make setup`",
         ) from error
-    from semcal_ros.workflows.calibrate import calibrate_recording
+    from semcal_ros.workflows.calibrate import CalibrateOptions, calibrate_recording
     from semcal_ros.workflows.simulate import simulate
 
     with tempfile.TemporaryDirectory(prefix="semcal-demo-") as folder:
@@ -82,7 +82,9 @@ def command(port: int, size: int, duration: float | None, browser: bool) -> None
                 size=_VIEW_SIZE,
                 on_progress=on_progress,
             )
-            done = calibrate_recording(bag, config="virtual_sem", on_progress=on_progress)
+            done = calibrate_recording(
+                bag, CalibrateOptions(config="virtual_sem", on_progress=on_progress)
+            )
         done.calibration.save(file)
 
         def say(address: str, about: str) -> None:

@@ -26,7 +26,7 @@ from semcal_ros.cli.options import PATH, Quantity, config_option
 from semcal_ros.cli.output import echo_json
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import diagnose
-from semcal_ros.doctor.findings import Finding, Severity, explain_figures
+from semcal_ros.doctor.findings import CheckResult, Severity, explain_figures
 from semcal_ros.doctor.recording import diagnose_recording
 from semcal_ros.files.images.image_series import refuse_images
 
@@ -92,7 +92,7 @@ def command(
         sys.exit(1)
 
 
-def _count_levels(found: list[Finding]) -> dict[str, int]:
+def _count_levels(found: list[CheckResult]) -> dict[str, int]:
     levels = [finding.level for finding in found]
     return {
         "problems": levels.count(Severity.PROBLEM),
@@ -105,7 +105,7 @@ def _sum_up(levels: dict[str, int]) -> str:
     return f"{counted(levels['problems'], 'problem')}, {counted(levels['notes'], 'note')}, {levels['ok']} ok"
 
 
-def _as_dict(finding: Finding) -> dict[str, str]:
+def _as_dict(finding: CheckResult) -> dict[str, str]:
     return {
         "level": finding.level.value,
         "subject": finding.subject,

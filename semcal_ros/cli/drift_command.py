@@ -16,17 +16,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import click
 
-from semcal_ros.cli.options import (
-    FIGURE_SUFFIXES,
-    PATH,
-    Quantity,
-    calibration_option,
-    output_option,
-)
+from semcal_ros.cli.options import FIGURE_SUFFIXES, options_of
 from semcal_ros.cli.output import (
     echo_nominal_unit,
     echo_notes,
@@ -41,43 +37,50 @@ from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
 from semcal_ros.workflows.drift_video import write_drift_video
-from semcal_ros.workflows.track_drift import describe_forecast, describe_rate, track_drift
+from semcal_ros.workflows.options import Option
+from semcal_ros.workflows.track_drift import (
+    DriftOptions,
+    describe_forecast,
+    describe_rate,
+    track_recording,
+)
+
+
+@dataclass(frozen=True)
+class DriftOutputs:
+    """What is written and printed."""
+
+    output: Annotated[
+        Path,
+        Option(
+            "Table: .csv, .parquet or .xlsx.",
+            kind="path",
+            names=("-o", "--output"),
+            required=True,
+        ),
+    ]
+    plot: Annotated[Path | None, Option("Also draw a figure: .png, .svg or .pdf.", kind="path")] = (
+        None
+    )
+    video: Annotated[
+        Path | None,
+        Option("Frames as recorded, and in place beside them: .mp4 or .avi.", kind="path"),
+    ] = None
+    fps: Annotated[float, Option("Frames per second of the video.", between=FPS_RANGE)] = 10.0
+    forecast_s: Annotated[
+        float | None,
+        Option(
+            "Also forecast the drift this long after the last frame, such as 5s.", kind="time ahead"
+        ),
+    ] = None
 
 
 @click.command("drift")
 @recording_input
-@output_option("Table: .csv, .parquet or .xlsx.")
-@calibration_option("Work in rectified coordinates.")
-@click.option("--plot", type=PATH, help="Also draw a figure: .png, .svg or .pdf.")
-@click.option(
-    "--video", type=PATH, help="Frames as recorded, and in place beside them: .mp4 or .avi."
-)
-@click.option(
-    "--fps",
-    type=click.FloatRange(*FPS_RANGE),
-    default=10.0,
-    show_default=True,
-    help="Frames per second of the video.",
-)
-@click.option(
-    "--forecast",
-    type=Quantity("time", "s", "5s or 500ms", within=(0.0, 1e6)),
-    metavar="TIME",
-    help="Also forecast the drift this long after the last frame, such as 5s.",
-)
-@click.option(
-    "--live", is_flag=True, help="Drift as known live, without hindsight from later frames."
-)
+@options_of(DriftOutputs, "outputs")
+@options_of(DriftOptions)
 def command(
-    recording: RecordedFiles,
-    output: Path,
-    calibration: Path | None,
-    plot: Path | None,
-    video: Path | None,
-    fps: float,
-    forecast: float | None,
-    live: bool,
-    config: MicroscopeConfig,
+    recording: RecordedFiles, config: MicroscopeConfig, outputs: DriftOutputs, options: DriftOptions
 ) -> None:
     """Drift of the specimen in RECORDING at the centre of each frame, relative to the first one.
 
@@ -88,27 +91,25 @@ def command(
     Example:
       semcal drift recordings/gold --calibration cal.yaml -o drift.csv --plot drift.png
     """
-    outputs = (
-        ("-o", output, TABLE_SUFFIXES),
-        ("--plot", plot, FIGURE_SUFFIXES),
-        ("--video", video, tuple(VIDEO_CODECS)),
+    output, plot, video = outputs.output, outputs.plot, outputs.video
+    check_outputs(
+        (
+            ("-o", output, TABLE_SUFFIXES),
+            ("--plot", plot, FIGURE_SUFFIXES),
+            ("--video", video, tuple(VIDEO_CODECS)),
+        ),
+        recording=recording,
     )
-    check_outputs(outputs, recording=recording)
+    calibration, forecast = options.calibration, outputs.forecast_s
     with show_progress() as on_progress:
-        track = track_drift(
-            recording,
-            calibration=calibration,
-            config=config,
-            live=live,
-            on_progress=on_progress,
-        )
+        track = track_recording(recording, replace(options, config=config, on_progress=on_progress))
         if video is not None:
             write_drift_video(
                 recording,
                 track,
                 video,
                 calibration=calibration,
-                fps=fps,
+                fps=outputs.fps,
                 on_progress=on_progress,
             )
     track.save(output)

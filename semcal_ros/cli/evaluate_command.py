@@ -21,8 +21,7 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.cli.grid_options import squares_and_pattern
-from semcal_ros.cli.options import PATH, dask_option, json_option
+from semcal_ros.cli.options import PATH, json_option, options_of
 from semcal_ros.cli.output import (
     echo_json,
     echo_notes,
@@ -35,22 +34,19 @@ from semcal_ros.cli.recording_input import recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.workflows.evaluate import evaluate
+from semcal_ros.workflows.evaluate import EvaluateOptions, evaluate_recording
 
 
 @click.command("evaluate")
 @click.argument("calibration", type=PATH)
 @recording_input
-@squares_and_pattern
-@dask_option
+@options_of(EvaluateOptions)
 @json_option
 def command(
     calibration: Path,
     recording: RecordedFiles,
     config: MicroscopeConfig,
-    squares: tuple[float, ...] | None,
-    pattern: str,
-    dask: str | None,
+    options: EvaluateOptions,
     as_json: bool,
 ) -> None:
     """Reprojection RMS of CALIBRATION on a grid RECORDING that it was not made from.
@@ -63,14 +59,8 @@ def command(
       semcal evaluate cal.yaml recordings/other_grid
     """
     with show_progress() as on_progress:
-        result = evaluate(
-            calibration,
-            recording,
-            config=config,
-            squares_m=squares,
-            pattern=pattern,
-            dask=dask,
-            on_progress=on_progress,
+        result = evaluate_recording(
+            calibration, recording, replace(options, config=config, on_progress=on_progress)
         )
     if as_json:
         summary = asdict(replace(result, rejections=()))

@@ -39,8 +39,6 @@ from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.extend import RecordingExtension, extend
 
-__all__ = ["command", "echo_pairs", "echo_steps"]
-
 # Pairs that were left out, and are named.
 _MOST_NAMED = 3
 

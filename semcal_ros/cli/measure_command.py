@@ -17,13 +17,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated
 
 import click
 
-from semcal_ros.applications.cantilever import SHAPES, group_frames
-from semcal_ros.cli.options import FIGURE_SUFFIXES, LENGTH, PATH, calibration_option, output_option
+from semcal_ros.applications.cantilever import group_frames
+from semcal_ros.cli.options import FIGURE_SUFFIXES, options_of
 from semcal_ros.cli.output import echo_notes, echo_paths, echo_table, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recordings_input
 from semcal_ros.config.config import MicroscopeConfig
@@ -31,31 +32,33 @@ from semcal_ros.files.images.write import PixelScale
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
-from semcal_ros.workflows.measure_cantilever import CantileverMeasurement, measure_cantilever
+from semcal_ros.workflows.measure_cantilever import (
+    CantileverMeasurement,
+    CantileverOptions,
+    measure_recorded_cantilever,
+)
+from semcal_ros.workflows.options import Option
 
-if TYPE_CHECKING:
-    PairParam = click.ParamType[tuple[float, float]]
-else:
-    PairParam = click.ParamType
 
+@dataclass(frozen=True)
+class CantileverOutputs:
+    """What is written."""
 
-class _PixelType(PairParam):
-    """Two numbers: column and row."""
-
-    name = "X,Y"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, float]:
-        if isinstance(value, tuple):
-            return value
-        try:
-            x, y = (float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not a pair of pixel coordinates such as 120.5,300", param, ctx)
-        if not (math.isfinite(x) and math.isfinite(y)):
-            self.fail(f"{value!r} is not finite", param, ctx)
-        return x, y
+    output: Annotated[
+        Path,
+        Option(
+            "Table: .csv, .parquet or .xlsx.",
+            kind="path",
+            names=("-o", "--output"),
+            required=True,
+        ),
+    ]
+    plot: Annotated[Path | None, Option("Deflection of each pose: png, svg, pdf.", kind="path")] = (
+        None
+    )
+    strip: Annotated[Path | None, Option("Annotated frames: png, svg or pdf.", kind="path")] = None
+    video: Annotated[Path | None, Option("Annotated frames: .mp4 or .avi.", kind="path")] = None
+    fps: Annotated[float, Option("Frames per second of the video.", between=FPS_RANGE)] = 4.0
 
 
 @click.group("measure", context_settings={"help_option_names": ["-h", "--help"]})
@@ -70,58 +73,13 @@ def command() -> None:
 
 @command.command("cantilever")
 @recordings_input
-@calibration_option(required=True)
-@click.option(
-    "--length",
-    required=True,
-    type=LENGTH,
-    metavar="LENGTH",
-    help="Length of the cantilever, such as 35um; a bare number is in m.",
-)
-@output_option("Table: .csv, .parquet or .xlsx.")
-@click.option("--plot", type=PATH, help="Deflection of each pose: png, svg, pdf.")
-@click.option("--strip", type=PATH, help="Annotated frames: png, svg or pdf.")
-@click.option("--video", type=PATH, help="Annotated frames: .mp4 or .avi.")
-@click.option("--fps", type=click.FloatRange(*FPS_RANGE), default=4.0, show_default=True)
-@click.option(
-    "--poses",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Number of poses at each magnification, with equally many frames each; "
-    "by default, each frame is a pose.",
-)
-@click.option(
-    "--shape",
-    type=click.Choice(SHAPES),
-    default="free",
-    show_default=True,
-    help="Shape of the bent beam: terms of second and third order; a beam loaded at its end; second order.",
-)
-@click.option(
-    "--base",
-    "bases",
-    type=_PixelType(),
-    multiple=True,
-    help="Base of the cantilever in the first frame, if it is not found automatically; "
-    "once, or once for each magnification in the order of the recording.",
-)
-@click.option(
-    "--tip", "tips", type=_PixelType(), multiple=True, help="Free end of the cantilever, likewise."
-)
+@options_of(CantileverOptions)
+@options_of(CantileverOutputs, "outputs")
 def cantilever(
     recordings: list[RecordedFiles],
-    calibration: Path,
-    length: float,
-    output: Path,
-    plot: Path | None,
-    strip: Path | None,
-    video: Path | None,
-    fps: float,
-    poses: int | None,
-    shape: str,
-    bases: tuple[tuple[float, float], ...],
-    tips: tuple[tuple[float, float], ...],
     config: MicroscopeConfig,
+    options: CantileverOptions,
+    outputs: CantileverOutputs,
 ) -> None:
     """Bending of a cantilever in RECORDINGS: deflection of its free end in each frame.
 
@@ -136,39 +94,33 @@ def cantilever(
     """
     check_outputs(
         [
-            ("-o", output, TABLE_SUFFIXES),
-            ("--plot", plot, FIGURE_SUFFIXES),
-            ("--strip", strip, FIGURE_SUFFIXES),
-            ("--video", video, tuple(VIDEO_CODECS)),
+            ("-o", outputs.output, TABLE_SUFFIXES),
+            ("--plot", outputs.plot, FIGURE_SUFFIXES),
+            ("--strip", outputs.strip, FIGURE_SUFFIXES),
+            ("--video", outputs.video, tuple(VIDEO_CODECS)),
         ]
     )
     with show_progress() as on_progress:
-        done = measure_cantilever(
-            recordings,
-            calibration=calibration,
-            length_m=length,
-            poses=poses,
-            shape=shape,
-            bases=bases,
-            tips=tips,
-            config=config,
-            on_progress=on_progress,
+        done = measure_recorded_cantilever(
+            recordings, replace(options, config=config, on_progress=on_progress)
         )
-    done.save(output)
+    done.save(outputs.output)
     with show_progress("drawing"):
-        _draw(done, plot, strip, video, fps)
+        _draw(done, outputs)
     echo_notes(done.notes)
     _echo_result(done)
-    echo_paths({"deflections": output, "plot": plot, "strip": strip, "video": video})
+    echo_paths(
+        {
+            "deflections": outputs.output,
+            "plot": outputs.plot,
+            "strip": outputs.strip,
+            "video": outputs.video,
+        }
+    )
 
 
-def _draw(
-    done: CantileverMeasurement,
-    plot: Path | None,
-    strip: Path | None,
-    video: Path | None,
-    fps: float,
-) -> None:
+def _draw(done: CantileverMeasurement, outputs: CantileverOutputs) -> None:
+    plot, strip, video = outputs.plot, outputs.strip, outputs.video
     if plot is None and strip is None and video is None:
         return
     # Imported here, so that a run without a figure does not wait for matplotlib.
@@ -191,7 +143,7 @@ def _draw(
         firsts = [group[0] for group in group_frames(len(images[0]), done.poses)]
         write_strip_figure(images, series, scales, firsts, strip)
     if video is not None:
-        write_bending_video(images, series, scales, done.poses, fps, video)
+        write_bending_video(images, series, scales, done.poses, outputs.fps, video)
 
 
 def _echo_result(done: CantileverMeasurement) -> None:

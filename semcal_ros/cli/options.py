@@ -12,19 +12,31 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Options that several commands share, each described once."""
+"""Options of commands: made from dataclasses, and those that several commands share."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterable
+import types
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, dataclass, replace
+from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 import click
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tiff.values import angle_in_degrees, plain_number, quantity
+from semcal_ros.workflows.options import (
+    OVERWRITE,
+    SQUARES,
+    Keyword,
+    Option,
+    OptionField,
+    option_fields,
+)
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -113,7 +125,7 @@ config_option = click.option(
 
 def squares_option(text: str) -> Callable[[Command], Command]:
     """``--squares`` with its help text."""
-    return click.option("--squares", callback=parse_lengths, metavar="LENGTH,...", help=text)
+    return make_option(OptionField("squares", Any, None, replace(SQUARES, text=text)))
 
 
 def parse_lengths(
@@ -149,14 +161,6 @@ def parse_tilts(
     return tuple(angle for angle in found if angle is not None)
 
 
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace an existing output, once the new one is complete."
-)
-dask_option = click.option(
-    "--dask",
-    metavar="ADDRESS",
-    help="Dask scheduler, such as tcp://host:8786, whose workers share the work.",
-)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, in SI units.")
 
 
@@ -175,16 +179,6 @@ def calibration_option(
 def no_drift_option(text: str) -> Callable[[Command], Command]:
     """``--no-drift`` with its help text."""
     return click.option("--no-drift", is_flag=True, help=text)
-
-
-def interpolation_option(default: str) -> Callable[[Command], Command]:
-    """``--interpolation`` with its default."""
-    return click.option(
-        "--interpolation",
-        type=click.Choice(["linear", "cubic", "lanczos4"]),
-        default=default,
-        show_default=True,
-    )
 
 
 def parse_ratio(
@@ -224,24 +218,295 @@ def parse_magnification(
 
 
 def refuse_with(option: str, why: str, names: Iterable[str]) -> None:
-    """Refuse parameters of a command that were given on the command line beside an option.
+    """Refuse options that were given on the command line beside another one, even with the value of their default.
 
     Parameters
     ----------
     option, why
-        The option, and why it goes with none of them.
+        The other option, and why it goes with none of them.
     names
-        Of the parameters.
+        Of the options, such as ``--tilts``; what the command does not have is passed over.
 
     Raises
     ------
     InvalidValueError
         If one of them was given.
     """
-    context = click.get_current_context()
+    given = set(given_options())
     for name in names:
-        if context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT):
-            given = "--" + name.replace("_", "-")
+        if name in given:
             raise InvalidValueError(
-                f"{given} with {option}, {why}", expected="one of the two", do=f"leave out {given}"
+                f"{name} with {option}, {why}", expected="one of the two", do=f"leave out {name}"
             )
+
+
+def given_options() -> list[str]:
+    """Return the options that the user gave to the command that runs, such as ``--tilts``."""
+    context = click.get_current_context()
+    # A value may be None, or equal to the default, although it was given.
+    nothing = (None, click.core.ParameterSource.DEFAULT)
+    return [
+        max(parameter.opts, key=len)
+        for parameter in context.command.params
+        if parameter.name and context.get_parameter_source(parameter.name) not in nothing
+    ]
+
+
+def refuse_grid_options(why: str) -> None:
+    """Refuse the first of these options that the user gave, for work that looks at no grid.
+
+    Parameters
+    ----------
+    why
+        What the work looks at instead, with the option that asked for it.
+
+    Raises
+    ------
+    InvalidValueError
+        If one was given, even with the value of its default.
+    """
+    given = given_options()
+    for name in ("--squares", "--pattern", "--untilted"):
+        if name in given:
+            raise InvalidValueError(
+                f"{name}, which is about a grid; {why}",
+                expected="one of the two",
+                do=f"leave out {name}",
+            )
+
+
+# -- options from dataclasses -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a value is written on the command line.
+
+    Attributes
+    ----------
+    metavar
+        What stands for it in the help.
+    type
+        Reads one.
+    parse
+        Callback of click that reads it; None for the type alone.
+    write
+        The default as a user would write it.
+    """
+
+    metavar: str | None = None
+    type: Any = None
+    parse: Callable[[click.Context, click.Parameter, Any], Any] | None = None
+    write: Callable[[Any], str] = str
+
+
+class _PixelType(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # likewise
+    """Two numbers: column and row."""
+
+    name = "X,Y"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            x, y = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not a pair of pixel coordinates such as 120.5,300", param, ctx)
+        if not (math.isfinite(x) and math.isfinite(y)):
+            self.fail(f"{value!r} is not finite", param, ctx)
+        return x, y
+
+
+def _parse_quarter_turn(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> float | None:
+    """One angle; in degrees."""
+    angles = parse_tilts(context, parameter, text)
+    if angles is None:
+        return None
+    if len(angles) != 1:
+        raise click.BadParameter(f"{text!r} is not one angle such as 90")
+    return math.degrees(angles[0])
+
+
+def _parse_numbers(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(",")) if text else ()
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not a list such as 1000,5000") from None
+
+
+def _parse_step(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> float | str | None:
+    if text is None or text == "auto":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is neither auto nor a number such as 500") from None
+
+
+def _parse_range(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not a range such as 500,10000") from None
+    return low, high
+
+
+def _parse_untilted(
+    _context: click.Context, _parameter: click.Parameter, text: str
+) -> str | tuple[str, ...]:
+    # Heavy for commands that look at no grid.
+    from semcal_ros.core.calibration.start import UNTILTED_MODES
+
+    if text in UNTILTED_MODES:
+        return text
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def _parse_length_in_picture(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, ...] | None:
+    """Length in m, number of the picture, and the four coordinates."""
+    if text is None:
+        return None
+    length, _, rest = text.partition("@")
+    try:
+        picture, *ends = (float(part) for part in rest.split(","))
+        if len(ends) != 4 or picture != int(picture):
+            raise ValueError
+    except ValueError:
+        raise click.BadParameter(
+            f"{text!r} is not a length such as 4.2um@0,110,80,300,82"
+        ) from None
+    return (float(LENGTH.convert(length, parameter, context)), picture, *ends)
+
+
+def _write_ratio(ratio: float) -> str:
+    return f"{100.0 * ratio:.12g}%"
+
+
+def _write_length(length_m: float) -> str:
+    for size, unit in ((1.0, "m"), (1e-3, "mm"), (1e-6, "um")):
+        if abs(length_m) >= size:
+            return f"{length_m / size:.12g}{unit}"
+    return f"{length_m / 1e-9:.12g}nm"
+
+
+def _write_tilts(tilts_rad: Iterable[float]) -> str:
+    return ",".join(f"{math.degrees(tilt):.12g}deg" for tilt in tilts_rad)
+
+
+#: By the names of :class:`~semcal_ros.workflows.options.Option`.
+KINDS: dict[str, Kind] = {
+    "": Kind(),
+    "path": Kind(type=PATH),
+    "length": Kind("LENGTH", LENGTH, write=_write_length),
+    "length or 0": Kind("LENGTH", LENGTH_OR_ZERO, write=_write_length),
+    "time ahead": Kind("TIME", Quantity("time", "s", "5s or 500ms", within=(0.0, 1e6))),
+    "lengths": Kind("LENGTH,...", parse=parse_lengths),
+    "ratio": Kind("RATIO", parse=parse_ratio, write=_write_ratio),
+    "magnification": Kind("G", parse=parse_magnification),
+    "pixel": Kind(type=_PixelType()),
+    "angle": Kind("ANGLE", parse=parse_angle),
+    "tilts": Kind("ANGLE,...", parse=parse_tilts, write=_write_tilts),
+    "quarter turn": Kind("ANGLE", parse=_parse_quarter_turn),
+    "numbers": Kind("G,G,...", parse=_parse_numbers),
+    "step": Kind("auto|G", parse=_parse_step),
+    "range": Kind("LOW,HIGH", parse=_parse_range),
+    "untilted": Kind("auto|all|none|N,N,...", parse=_parse_untilted),
+    "length in picture": Kind("LENGTH@N,X,Y,X,Y", parse=_parse_length_in_picture),
+}
+
+# Units at the end of a field's name, which the command line does not have: there, a quantity is given with its unit.
+_UNITS = re.compile(r"_(m|px|rad|deg|s)$")
+
+
+def _plain_type(hint: Any) -> Any:
+    """The type of a field without None."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return next(part for part in get_args(hint) if part is not type(None))
+    return hint
+
+
+def _is_flag(field: OptionField) -> bool:
+    return field.type is bool
+
+
+def make_option(field: OptionField) -> Callable[[Command], Command]:
+    """Return the option of click for a field whose meaning is an :class:`Option`."""
+    option = field.meaning
+    assert isinstance(option, Option)
+    names = option.names or ("--" + _UNITS.sub("", field.name).replace("_", "-"),)
+    kind = KINDS[option.kind]
+    settings: dict[str, Any] = {"help": option.text or None}
+    if _is_flag(field):
+        return click.option(*names, field.name, is_flag=True, **settings)
+    plain = _plain_type(field.type)
+    settings["metavar"] = option.metavar or kind.metavar
+    settings["type"], settings["callback"] = kind.type, kind.parse
+    if option.choices:
+        settings["type"] = click.Choice([str(choice) for choice in option.choices])
+        if plain is int:
+            settings["callback"] = lambda _context, _parameter, text: text and int(text)
+    elif not option.kind and option.repeated:
+        settings["type"] = get_args(plain)[0]
+    elif not option.kind and option.between:
+        limits: Any = click.IntRange if plain is int else click.FloatRange
+        settings["type"] = limits(*option.between)
+    elif not option.kind:
+        settings["type"] = plain
+    if option.repeated:
+        settings["multiple"] = True
+    if option.required:
+        settings["required"] = True
+    elif field.default is not MISSING and field.default not in (None, ()):
+        settings |= {"default": kind.write(field.default), "show_default": True}
+    return click.option(*names, field.name, **settings)
+
+
+def options_of(
+    kind: type, name: str = "options", meanings: Mapping[str, Keyword] | None = None
+) -> Callable[[Command], Command]:
+    """Give a command the options that the fields of a dataclass mean, and call it with such an object.
+
+    Parameters
+    ----------
+    kind
+        The dataclass; a field that is a flag is true by default where the option takes something away.
+    name
+        Of the parameter of the command.
+    meanings
+        As of :func:`~semcal_ros.workflows.options.option_fields`.
+    """
+    found = [one for one in option_fields(kind, meanings) if isinstance(one.meaning, Option)]
+
+    def decorate(command: Command) -> Command:
+        @wraps(command)
+        def call(**given: Any) -> Any:
+            values = {field.name: given.pop(field.name) for field in found}
+            for field in found:
+                if _is_flag(field) and field.default is True:
+                    values[field.name] = not values[field.name]
+            return command(**{name: kind(**values)}, **given)
+
+        decorated: Any = call
+        for field in reversed(found):
+            decorated = make_option(field)(decorated)
+        result: Command = decorated
+        return result
+
+    return decorate
+
+
+overwrite_option = make_option(OptionField("overwrite", bool, False, OVERWRITE))

@@ -62,14 +62,14 @@ def show_progress(first: str = "opening") -> Iterator[Callable[[str, int, int | 
     if not sys.stderr.isatty():
         yield lambda _stage, _done, _total: None
         return
-    shown = _Progress(first)
+    shown = _ProgressBar(first)
     try:
         yield shown.show
     finally:
         shown.close()
 
 
-class _Progress:
+class _ProgressBar:
     """The bar of the current stage; a thread keeps it alive while nothing is reported."""
 
     def __init__(self, first: str) -> None:

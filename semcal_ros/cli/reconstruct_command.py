@@ -17,21 +17,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
 from semcal_ros.applications.reconstruction.tilt_series import HeightMap
-from semcal_ros.cli.options import (
-    LENGTH_OR_ZERO,
-    PATH,
-    calibration_option,
-    dask_option,
-    output_option,
-    parse_angle,
-    parse_tilts,
-)
+from semcal_ros.cli.options import options_of
 from semcal_ros.cli.output import echo_json, echo_notes, echo_paths, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
@@ -39,84 +33,66 @@ from semcal_ros.core.wording import counted
 from semcal_ros.files.meshes import MESH_SUFFIXES, UNITS_PER_M
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tables import TABLE_SUFFIXES
-from semcal_ros.workflows.measure_relief import RELIEF_SUFFIXES, measure_relief
-from semcal_ros.workflows.reconstruct import reconstruct
+from semcal_ros.workflows.measure_relief import (
+    RELIEF_SUFFIXES,
+    ReliefOptions,
+    measure_recorded_relief,
+)
+from semcal_ros.workflows.options import Option
+from semcal_ros.workflows.reconstruct import ReconstructOptions, reconstruct_ball
+
+
+@dataclass(frozen=True)
+class ReconstructOutputs:
+    """What is written and printed."""
+
+    output: Annotated[
+        Path,
+        Option(
+            "Mesh of a ball: .ply or .stl. Heights: .tif, or points as .ply, .csv, .parquet, .xlsx.",
+            kind="path",
+            names=("-o", "--output"),
+            required=True,
+        ),
+    ]
+    cloud: Annotated[Path | None, Option("Also write all points: .ply.", kind="path")] = None
+    figure: Annotated[Path | None, Option("Image of cloud and mesh: .png.", kind="path")] = None
+    unit: Annotated[
+        str, Option("Unit of lengths in the mesh and the cloud.", choices=tuple(UNITS_PER_M))
+    ] = "nm"
+    as_json: Annotated[bool, Option("Print the result as JSON.", names=("--json",))] = False
+
+    def check(
+        self,
+        output: Sequence[str],
+        cloud: Sequence[str],
+        recording: RecordedFiles | None = None,
+    ) -> None:
+        """Refuse files with other suffixes, and those that would replace a part of the recording."""
+        outputs = [
+            ("-o", self.output, output),
+            ("--cloud", self.cloud, cloud),
+            ("--figure", self.figure, (".png",)),
+        ]
+        check_outputs(outputs, recording=recording)
+
+    def echo(self, name: str) -> None:
+        """Say what was written, unless JSON was asked for; ``name`` is that of the first file."""
+        if not self.as_json:
+            echo_paths({name: self.output, "points": self.cloud, "image": self.figure})
 
 
 @click.command("reconstruct")
 @recording_input
-@calibration_option("Needed for a ball; for tilted images it gives the pixel size and its 1-sigma.")
-@output_option(
-    "Mesh of a ball: .ply or .stl. Heights: .tif, or points as .ply, .csv, .parquet, .xlsx."
-)
-@click.option(
-    "--tilts",
-    callback=parse_tilts,
-    metavar="ANGLE,...",
-    help="Tilts of two or three images, such as 0deg,6deg,12deg (bare numbers are degrees), instead of those of the"
-    " stage: measures heights.",
-)
-@click.option(
-    "--tilt-axis",
-    callback=parse_angle,
-    metavar="ANGLE",
-    help="About where the tilt axis points in the image, such as 90deg; its sense tells hills from dents.",
-)
-@click.option(
-    "--tilt-sigma",
-    callback=parse_angle,
-    metavar="ANGLE",
-    help="1-sigma of each tilt, such as 0.1deg, instead of that of the configuration.",
-)
-@click.option("--cloud", type=PATH, help="Also write all points: .ply.")
-@click.option("--figure", type=PATH, help="Image of cloud and mesh: .png.")
-@click.option(
-    "--unit",
-    type=click.Choice(list(UNITS_PER_M)),
-    default="nm",
-    show_default=True,
-    help="Unit of lengths in the mesh and the cloud.",
-)
-@click.option(
-    "--spacing",
-    type=click.FloatRange(3.0, 100.0),
-    default=5.0,
-    show_default=True,
-    help="Least distance of features in px.",
-)
-@click.option(
-    "--keyframes",
-    type=click.IntRange(3, 2000),
-    default=150,
-    show_default=True,
-    help="Largest number of keyframes used.",
-)
-@click.option(
-    "--height-sigma",
-    type=LENGTH_OR_ZERO,
-    default="10um",
-    show_default=True,
-    metavar="LENGTH",
-    help="1-sigma of the height above or below the plane of the calibration.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-@dask_option
+@options_of(ReconstructOutputs, "outputs")
+@options_of(ReliefOptions, "relief")
+@options_of(ReconstructOptions)
 def command(
     recording: RecordedFiles,
-    calibration: Path | None,
-    output: Path,
-    tilts: tuple[float, ...] | None,
-    tilt_axis: float | None,
-    tilt_sigma: float | None,
-    cloud: Path | None,
-    figure: Path | None,
-    unit: str,
-    spacing: float,
-    keyframes: int,
-    height_sigma: float,
-    as_json: bool,
     config: MicroscopeConfig,
-    dask: str | None,
+    outputs: ReconstructOutputs,
+    relief: ReliefOptions,
+    options: ReconstructOptions,
 ) -> None:
     """Heights from two or three tilted images, or the shape of a ball that turns in RECORDING.
 
@@ -125,105 +101,52 @@ def command(
       semcal reconstruct a.tif b.tif c.tif --tilts -7deg,0deg,7deg -o heights.tif --figure heights.png
       semcal reconstruct recordings/ball --calibration cal.yaml -o ball.ply --figure ball.png
     """
-    if calibration is None or any(given is not None for given in (tilts, tilt_axis, tilt_sigma)):
-        _measure_relief(
-            recording,
-            config,
-            calibration,
-            output,
-            cloud,
-            figure,
-            unit=unit,
-            tilts=tilts,
-            tilt_axis=tilt_axis,
-            tilt_sigma=tilt_sigma,
-            as_json=as_json,
-        )
+    stated = (relief.tilts_rad, relief.axis_rad, relief.tilt_sigma_rad)
+    if options.calibration is None or any(given is not None for given in stated):
+        known = replace(relief, config=config, calibration=options.calibration)
+        _measure_relief(recording, outputs, known)
         return
-    check_outputs(
-        [
-            ("-o", output, MESH_SUFFIXES),
-            ("--cloud", cloud, (".ply",)),
-            ("--figure", figure, (".png",)),
-        ]
-    )
+    outputs.check(MESH_SUFFIXES, (".ply",))
     with show_progress() as on_progress:
-        done = reconstruct(
-            recording,
-            calibration=calibration,
-            config=config,
-            spacing_px=spacing,
-            keyframes=keyframes,
-            height_sigma_m=height_sigma,
-            dask=dask,
-            on_progress=on_progress,
-        )
-    done.save_mesh(output, unit=unit)
-    if cloud is not None:
-        done.save_cloud(cloud, unit=unit)
-    if figure is not None:
+        done = reconstruct_ball(recording, replace(options, config=config, on_progress=on_progress))
+    done.save_mesh(outputs.output, unit=outputs.unit)
+    if outputs.cloud is not None:
+        done.save_cloud(outputs.cloud, unit=outputs.unit)
+    if outputs.figure is not None:
         # Imported here, so that a run without a figure does not wait for matplotlib.
         from semcal_ros.report.reconstruction_figures import write_ball_figure
 
         with show_progress("drawing"):
-            write_ball_figure(done.structure, done.ball, figure)
-    if as_json:
+            write_ball_figure(done.structure, done.ball, outputs.figure)
+    if outputs.as_json:
         echo_json({**done.summary(), "notes": done.notes})
     else:
         _echo_summary(done.summary())
     echo_notes(done.notes)
-    if not as_json:
-        echo_paths({"mesh": output, "points": cloud, "image": figure})
+    outputs.echo("mesh")
 
 
 def _measure_relief(
-    recording: RecordedFiles,
-    config: MicroscopeConfig,
-    calibration: Path | None,
-    output: Path,
-    cloud: Path | None,
-    figure: Path | None,
-    *,
-    unit: str,
-    tilts: tuple[float, ...] | None,
-    tilt_axis: float | None,
-    tilt_sigma: float | None,
-    as_json: bool,
+    recording: RecordedFiles, outputs: ReconstructOutputs, relief: ReliefOptions
 ) -> None:
-    check_outputs(
-        [
-            ("-o", output, RELIEF_SUFFIXES),
-            ("--cloud", cloud, (".ply", *TABLE_SUFFIXES)),
-            ("--figure", figure, (".png",)),
-        ],
-        recording=recording,
-    )
+    outputs.check(RELIEF_SUFFIXES, (".ply", *TABLE_SUFFIXES), recording)
     with show_progress() as on_progress:
-        done = measure_relief(
-            recording,
-            tilts_rad=tilts,
-            axis_rad=tilt_axis,
-            tilt_sigma_rad=tilt_sigma,
-            calibration=calibration,
-            config=config,
-            on_progress=on_progress,
-        )
-    done.save(output, unit=unit)
-    if cloud is not None:
-        done.save(cloud, unit=unit)
-    if figure is not None:
+        done = measure_recorded_relief(recording, replace(relief, on_progress=on_progress))
+    done.save(outputs.output, unit=outputs.unit)
+    if outputs.cloud is not None:
+        done.save(outputs.cloud, unit=outputs.unit)
+    if outputs.figure is not None:
         # Imported here, so that a run without a figure does not wait for matplotlib.
         from semcal_ros.report.reconstruction_figures import write_relief_figure
 
         with show_progress("drawing"):
-            write_relief_figure(done.heights, figure)
-    if as_json:
+            write_relief_figure(done.heights, outputs.figure)
+    if outputs.as_json:
         echo_json({**done.summary(), "notes": done.notes})
     else:
         _echo_relief(done.heights)
     echo_notes(done.notes)
-    if not as_json:
-        echo_paths({"heights": output, "points": cloud, "image": figure})
+    outputs.echo("heights")
 
 
 def _echo_relief(found: HeightMap) -> None:

@@ -16,59 +16,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from semcal_ros.cli.options import (
-    calibration_option,
-    dask_option,
-    interpolation_option,
-    no_drift_option,
-    overwrite_option,
-)
+from semcal_ros.cli.options import options_of
 from semcal_ros.cli.output import echo_notes, echo_states, show_progress
 from semcal_ros.cli.recording_input import check_spared, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.workflows.rectify import rectify
+from semcal_ros.workflows.rectify import RectifyOptions, rectify_recording
 
 
 @click.command("rectify")
 @recording_input
-@calibration_option(required=True)
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="FILE.tif|FOLDER/|FILE.png|BAG",
-    help="A TIFF of all frames, a folder of TIFFs (its name ends with /), a PNG of one frame, or a bag.",
-)
-@click.option(
-    "--scale-bar",
-    is_flag=True,
-    help="Append a strip with a scale bar and its uncertainty below each picture.",
-)
-@no_drift_option("Leave drift in; correct distortion only.")
-@interpolation_option("linear")
-@click.option(
-    "--namespace", default="/sem", show_default=True, help="Namespace of the topics in the output."
-)
-@overwrite_option
-@dask_option
-def command(
-    recording: RecordedFiles,
-    calibration: Path,
-    output: str,
-    scale_bar: bool,
-    no_drift: bool,
-    interpolation: str,
-    namespace: str,
-    config: MicroscopeConfig,
-    overwrite: bool,
-    dask: str | None,
-) -> None:
+@options_of(RectifyOptions)
+def command(recording: RecordedFiles, config: MicroscopeConfig, options: RectifyOptions) -> None:
     """Drift-free, undistorted copy of RECORDING in square pixels.
 
     As a bag, with camera_info and projection per frame; as TIFFs, with pixel size, times and conditions.
@@ -78,20 +43,11 @@ def command(
       semcal rectify tiffs --calibration cal.yaml -o corrected/ --scale-bar
       semcal rectify recordings/zoom --calibration cal.yaml -o zoom_rect
     """
+    output = str(options.output)
     check_spared("-o", Path(output), recording)
     with show_progress() as on_progress:
-        done = rectify(
-            recording,
-            output,
-            calibration=calibration,
-            config=config,
-            drift=not no_drift,
-            interpolation=interpolation,
-            namespace=namespace,
-            overwrite=overwrite,
-            scale_bar=scale_bar,
-            dask=dask,
-            on_progress=on_progress,
+        done = rectify_recording(
+            recording, replace(options, config=config, on_progress=on_progress)
         )
     echo_notes(done.notes)
     if done.extrapolated:
@@ -100,7 +56,7 @@ def command(
             err=True,
         )
     echo_states(done.states)
-    if not no_drift and done.frame_count > 1 and not done.followed:
+    if options.drift and done.frame_count > 1 and not done.followed:
         click.echo(
             f"warning: none of {counted(done.frame_count, 'frame')} was tracked: the drift is not known, "
             "and was left in",

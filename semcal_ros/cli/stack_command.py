@@ -16,21 +16,13 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from pathlib import Path
 
 import click
 import numpy as np
 
-from semcal_ros.cli.options import (
-    PATH,
-    calibration_option,
-    dask_option,
-    interpolation_option,
-    no_drift_option,
-    output_option,
-    parse_tilts,
-)
+from semcal_ros.cli.options import options_of
 from semcal_ros.cli.output import (
     echo_nominal_unit,
     echo_notes,
@@ -44,69 +36,17 @@ from semcal_ros.core.drift.scan_pairs import ScanPairDrift
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
-from semcal_ros.workflows.stack import StackResult, stack
+from semcal_ros.files.video import VIDEO_CODECS
+from semcal_ros.workflows.stack import StackOptions, StackResult, stack_recording
 
 # 1-sigma of the drift beyond which the average is visibly blurred, px.
 _UNKNOWN_PX = 1.0
 
 
-def parse_scan_pairs(
-    context: click.Context, parameter: click.Parameter, text: str | None
-) -> float | None:
-    """Callback of ``--scan-pairs``; in degrees."""
-    angles = parse_tilts(context, parameter, text)
-    if angles is None:
-        return None
-    if len(angles) != 1:
-        raise click.BadParameter(f"{text!r} is not one angle such as 90")
-    return math.degrees(angles[0])
-
-
 @click.command("stack")
 @recording_input
-@output_option("Average: .tif (32-bit, with the pixel size) or .png (as deep as the recording).")
-@calibration_option("Undo distortion, too.")
-@click.option("--sigma", type=PATH, help="Standard error of the average: .tif.")
-@click.option("--video", type=PATH, help="Stabilised video: .mp4 or .avi.")
-@click.option(
-    "--fps",
-    type=click.FloatRange(*FPS_RANGE),
-    default=10.0,
-    show_default=True,
-    help="Frames per second of the video.",
-)
-@click.option("--at", type=float, metavar="G", help="Take the frames of this magnification.")
-@click.option(
-    "--scale-bar",
-    is_flag=True,
-    help="Append a strip with a scale bar and its uncertainty below the average.",
-)
-@no_drift_option("Average the frames where they are.")
-@click.option(
-    "--scan-pairs",
-    metavar="ANGLE",
-    callback=parse_scan_pairs,
-    help="Of 2 to 12 frames, every second one was scanned with a scan rotation of 90 or -90 degrees (90: it shows the"
-    " specimen turned clockwise): undo the drift within the scans, and average the square that all show.",
-)
-@interpolation_option("cubic")
-@dask_option
-def command(
-    recording: RecordedFiles,
-    output: Path,
-    calibration: Path | None,
-    sigma: Path | None,
-    video: Path | None,
-    fps: float,
-    at: float | None,
-    scale_bar: bool,
-    no_drift: bool,
-    scan_pairs: float | None,
-    interpolation: str,
-    config: MicroscopeConfig,
-    dask: str | None,
-) -> None:
+@options_of(StackOptions)
+def command(recording: RecordedFiles, config: MicroscopeConfig, options: StackOptions) -> None:
     """Average of the frames of RECORDING, each moved to where the specimen was in the first one.
 
     Frames whose drift is not known are left out.
@@ -115,31 +55,23 @@ def command(
     Example:
       semcal stack recordings/gold --calibration cal.yaml -o gold.tif --video gold.mp4
     """
-    outputs = (
-        ("-o", output, IMAGE_SUFFIXES),
-        ("--sigma", sigma, TIFF_SUFFIXES),
-        ("--video", video, tuple(VIDEO_CODECS)),
-    )
+    written = {
+        name: None if given is None else Path(given)
+        for name, given in (
+            ("-o", options.output),
+            ("--sigma", options.sigma),
+            ("--video", options.video),
+        )
+    }
+    suffixes = (IMAGE_SUFFIXES, TIFF_SUFFIXES, tuple(VIDEO_CODECS))
+    outputs = [(*one, ends) for one, ends in zip(written.items(), suffixes, strict=True)]
     check_outputs(outputs, recording=recording)
     with show_progress() as on_progress:
-        result = stack(
-            recording,
-            calibration=calibration,
-            config=config,
-            at=at,
-            drift=not no_drift,
-            scan_pairs_deg=scan_pairs,
-            interpolation=interpolation,
-            video=video,
-            fps=fps,
-            output=output,
-            sigma=sigma,
-            scale_bar=scale_bar,
-            dask=dask,
-            on_progress=on_progress,
+        result = stack_recording(
+            recording, replace(options, config=config, on_progress=on_progress)
         )
-    _echo_result(result, calibrated=calibration is not None)
-    echo_paths({"average": output, "standard error": sigma, "video": video})
+    _echo_result(result, calibrated=options.calibration is not None)
+    echo_paths(dict(zip(("average", "standard error", "video"), written.values(), strict=True)))
 
 
 def _echo_result(result: StackResult, *, calibrated: bool) -> None:

@@ -16,43 +16,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from semcal_ros.cli.check_command import echo_check
-from semcal_ros.cli.grid_options import grid_options
-from semcal_ros.cli.options import PATH, output_option, parse_ratio
+from semcal_ros.cli.options import PATH, options_of, output_option
 from semcal_ros.cli.output import echo_notes, echo_rejected, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.workflows.check_and_update import update
+from semcal_ros.workflows.check_and_update import UpdateOptions, update_by_recording
 
 
 @click.command("update")
 @click.argument("calibration", type=PATH)
 @recording_input
 @output_option("Renewed calibration file.")
-@grid_options
-@click.option(
-    "--ageing",
-    callback=parse_ratio,
-    default=f"{100.0 * DEFAULT_AGEING:g}%",
-    show_default=True,
-    metavar="RATIO",
-    help="1-sigma of a change of the scale since the calibration that the views need not prove.",
-)
+@options_of(UpdateOptions)
 def command(
     calibration: Path,
     recording: RecordedFiles,
     output: Path,
     config: MicroscopeConfig,
-    squares: tuple[float, ...] | None,
-    pattern: str,
-    untilted: str | tuple[str, ...],
-    ageing: float,
+    options: UpdateOptions,
 ) -> None:
     """Renew CALIBRATION with a few views of the grid in RECORDING.
 
@@ -64,15 +52,8 @@ def command(
     """
     check_outputs([("-o", output, ())], recording=recording)
     with show_progress() as on_progress:
-        done = update(
-            calibration,
-            recording,
-            config=config,
-            squares_m=squares,
-            untilted=untilted,
-            pattern=pattern,
-            ageing=ageing,
-            on_progress=on_progress,
+        done = update_by_recording(
+            calibration, recording, replace(options, config=config, on_progress=on_progress)
         )
     done.calibration.save(output)
     echo_verdict(done.calibration)

@@ -32,7 +32,9 @@ from semcal_ros.bridge.projection import (
 from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibrated_frame import CalibratedFrame, describe_missing_camera
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.parameters import Parameters
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo
@@ -82,6 +84,8 @@ class CalibratedStream:
         chosen = load_config(config) if isinstance(config, str) else config
         endpoints = Endpoints(node)
         self._reporter = Reporter(node.get_logger(), node.get_clock())
+        # Nothing is declared: a node of others has no parameters of the suite's.
+        context = NodeContext(node, chosen, Parameters(node, ()), endpoints, self._reporter)
         self._images: dict[int, StreamFrame] = {}
         self._parts: dict[str, dict[int, Any]] = {"projection": {}, "covariance": {}}
         if drift:
@@ -103,13 +107,7 @@ class CalibratedStream:
             endpoints.subscribe(Image, topic, self._keeps(name, read), stream_output())
         # Frames that were scanned while the magnification changed are not valid, and are handed on for their picture.
         self._input = FrameInput(
-            chosen,
-            {"mixed_frames": "flag"},
-            endpoints,
-            self._reporter,
-            self._on_image,
-            topic="image_rect",
-            databar_rows=0,
+            context, self._on_image, topic="image_rect", databar_rows=0, keep_mixed=True
         )
         # Publishers come and go, with another quality of service.
         self._timer = node.create_timer(_CHECKED_S, endpoints.check_publishers)

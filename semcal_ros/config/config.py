@@ -37,26 +37,10 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from semcal_ros.config.files import config_names, find_config_file, load_yaml, read_config_text
+from semcal_ros.config.files import find_config_file, load_yaml, read_config_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.core.wording import did_you_mean
-
-__all__ = [
-    "COMPRESSED_IMAGE_TYPE",
-    "IMAGE_TYPE",
-    "IMAGE_TYPES",
-    "STAGE_TYPE",
-    "ImageConfig",
-    "MagnificationConfig",
-    "MicroscopeConfig",
-    "StageConfig",
-    "StageSigmas",
-    "config_names",
-    "config_schema",
-    "load_config",
-    "parse_config",
-]
 
 IMAGE_TYPE: Final = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE_TYPE: Final = "sensor_msgs/msg/CompressedImage"
@@ -439,7 +423,7 @@ def load_config(name_or_path: str | Path) -> MicroscopeConfig:
     ----------
     name_or_path
         Path of a YAML file, or the bare name of one that is shipped (``"jsm820"``; see
-        :func:`config_names`).
+        :func:`~semcal_ros.config.files.config_names`).
 
     Raises
     ------

@@ -30,7 +30,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion
 
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.observations import Environment
 from semcal_ros.middleware.ament_prefix import prefixes_of_user
 from semcal_ros.middleware.transport_advice import (
@@ -67,7 +67,7 @@ _SHM = Path("/dev/shm")
 _INSTALLATIONS = Path("/opt/ros")
 
 
-def check_python(seen: Environment) -> list[Finding]:
+def check_python(seen: Environment) -> list[CheckResult]:
     """Check whether this version of Python is supported."""
     version = ".".join(map(str, seen.python))
     if _PYTHON[0] <= seen.python <= _PYTHON[1]:
@@ -77,7 +77,7 @@ def check_python(seen: Environment) -> list[Finding]:
     ]
 
 
-def check_packages(seen: Environment) -> list[Finding]:
+def check_packages(seen: Environment) -> list[CheckResult]:
     """Check whether the requirements of this package are installed in matching versions."""
     found = [
         problem(
@@ -111,7 +111,7 @@ def _unmet(seen: Environment, distribution: str) -> Iterator[tuple[Requirement, 
             continue  # metadata of other people: pip judges them
 
 
-def check_rclpy(seen: Environment) -> list[Finding]:
+def check_rclpy(seen: Environment) -> list[CheckResult]:
     """Check whether ROS 2 can be imported; otherwise say how to get it."""
     reason = seen.import_errors.get("rclpy")
     if reason is None:
@@ -144,7 +144,7 @@ def check_rclpy(seen: Environment) -> list[Finding]:
     ]
 
 
-def check_one_ros(seen: Environment) -> list[Finding]:
+def check_one_ros(seen: Environment) -> list[CheckResult]:
     """Check whether wheels and a sourced workspace are mixed, or wheels of two distributions."""
     rclpy = seen.packages.get("ros-rclpy")
     if rclpy is None:
@@ -179,7 +179,7 @@ def check_one_ros(seen: Environment) -> list[Finding]:
     return [ok("ROS 2 wheels", f"ros-rclpy {rclpy}")]
 
 
-def check_package_index(seen: Environment) -> list[Finding]:
+def check_package_index(seen: Environment) -> list[CheckResult]:
     """Check whether scripts and launch files of the user find the packages of this environment."""
     if "ros-rclpy" not in seen.packages or not seen.rclpy_file:
         return []
@@ -204,7 +204,7 @@ def _wrong_middleware(seen: Environment) -> bool:
     return bool(named) and named in seen.import_errors.get("rclpy", "")
 
 
-def check_rmw(seen: Environment) -> list[Finding]:
+def check_rmw(seen: Environment) -> list[CheckResult]:
     """Check which middleware is used."""
     if _wrong_middleware(seen):
         return [
@@ -229,7 +229,7 @@ def check_rmw(seen: Environment) -> list[Finding]:
     ]
 
 
-def check_domain(seen: Environment) -> list[Finding]:
+def check_domain(seen: Environment) -> list[CheckResult]:
     """Check whether the domain id is valid."""
     given = seen.environment.get("ROS_DOMAIN_ID", "")
     if not given:
@@ -254,7 +254,7 @@ def check_domain(seen: Environment) -> list[Finding]:
     return [ok("domain", f"ROS_DOMAIN_ID is {given}; nodes with another number are not seen")]
 
 
-def check_discovery(seen: Environment) -> list[Finding]:
+def check_discovery(seen: Environment) -> list[CheckResult]:
     """Check which hosts and processes can be discovered."""
     reach = seen.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     peers = seen.environment.get("ROS_STATIC_PEERS", "")
@@ -303,7 +303,7 @@ def _memory(seen: Environment) -> SharedMemory | None:
         return None  # check_profile reports it
 
 
-def check_profile(seen: Environment) -> list[Finding]:
+def check_profile(seen: Environment) -> list[CheckResult]:
     """Whether a profile is set and can be used; `large images` says whether it is needed."""
     if seen.rmw and not seen.rmw.startswith("rmw_fastrtps"):
         return []
@@ -342,7 +342,7 @@ def check_profile(seen: Environment) -> list[Finding]:
     return [ok("DDS profile", f"{memory.source}{where}: {size}")]
 
 
-def check_shared_memory(seen: Environment) -> list[Finding]:
+def check_shared_memory(seen: Environment) -> list[CheckResult]:
     """Check whether /dev/shm has room for the segment of one more process."""
     memory = _memory(seen)
     if memory is None or memory.segment_bytes is None or not seen.rmw.startswith("rmw_fastrtps"):
@@ -363,7 +363,7 @@ def check_shared_memory(seen: Environment) -> list[Finding]:
     return [ok("/dev/shm", f"{free / _MB:.0f} MiB are free")]
 
 
-def check_socket_buffers(seen: Environment) -> list[Finding]:
+def check_socket_buffers(seen: Environment) -> list[CheckResult]:
     """Check whether images from other hosts can arrive without loss."""
     have = seen.receive_buffer_bytes
     if have is None or local_only(seen.environment) or have >= _SOCKET_BYTES:
@@ -378,7 +378,7 @@ def check_socket_buffers(seen: Environment) -> list[Finding]:
     ]
 
 
-ENVIRONMENT_CHECKS: tuple[Callable[[Environment], list[Finding]], ...] = (
+ENVIRONMENT_CHECKS: tuple[Callable[[Environment], list[CheckResult]], ...] = (
     check_python,
     check_packages,
     check_rclpy,

@@ -52,7 +52,7 @@ class Severity(Enum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """One line of advice.
 
     Attributes
@@ -80,22 +80,22 @@ class Finding:
         return " ".join("; ".join(parts).split())
 
 
-def ok(subject: str, seen: str) -> Finding:
+def ok(subject: str, seen: str) -> CheckResult:
     """Make a finding that all is well."""
-    return Finding(Severity.OK, subject, seen)
+    return CheckResult(Severity.OK, subject, seen)
 
 
-def note(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
+def note(subject: str, seen: str, *, expected: str = "", do: str = "") -> CheckResult:
     """Make a finding that is worth knowing but breaks nothing."""
-    return Finding(Severity.NOTE, subject, seen, expected, do)
+    return CheckResult(Severity.NOTE, subject, seen, expected, do)
 
 
-def problem(subject: str, seen: str, *, expected: str = "", do: str = "") -> Finding:
+def problem(subject: str, seen: str, *, expected: str = "", do: str = "") -> CheckResult:
     """Make a finding that something cannot work."""
-    return Finding(Severity.PROBLEM, subject, seen, expected, do)
+    return CheckResult(Severity.PROBLEM, subject, seen, expected, do)
 
 
-def explain_figures(findings: Iterable[Finding]) -> list[str]:
+def explain_figures(findings: Iterable[CheckResult]) -> list[str]:
     """Return one sentence for each kind of figure that the findings show."""
     shown = [str(finding) for finding in findings]
     return [text for words, text in _FIGURES if any(words in line for line in shown)]

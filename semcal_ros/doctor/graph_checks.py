@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
 from semcal_ros.config.config import MicroscopeConfig, StageConfig
-from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.observations import Endpoint, Graph
 
 _IMAGE = "sensor_msgs/msg/Image"
@@ -98,7 +98,7 @@ def _stage_topic(stage: StageConfig, namespace: str) -> Topic:
     return Topic(name, stage.type, "stage", is_input=True, keys="stage", optional=True)
 
 
-def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
+def check_nodes(graph: Graph, namespace: str) -> list[CheckResult]:
     """Check which nodes of the suite run, and whether two have the same name."""
     found = [
         # Others may not mind.
@@ -128,7 +128,7 @@ def check_nodes(graph: Graph, namespace: str) -> list[Finding]:
     return found
 
 
-def check_topic(topic: Topic, graph: Graph) -> list[Finding]:
+def check_topic(topic: Topic, graph: Graph) -> list[CheckResult]:
     """Publishers and subscribers of a topic, with type and quality of service; empty for an unused output."""
     publishers = graph.publishers.get(topic.name, ())
     subscriptions = graph.subscriptions.get(topic.name, ())
@@ -165,7 +165,7 @@ def _format_nodes(endpoints: list[Endpoint]) -> str:
     return ", ".join(dict.fromkeys(e.node for e in endpoints))
 
 
-def _check_types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[Finding]:
+def _check_types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterator[CheckResult]:
     for end in ends:
         if end.type != topic.type:
             change = "correct the node"
@@ -181,7 +181,7 @@ def _check_types(topic: Topic, ends: tuple[Endpoint, ...], verb: str) -> Iterato
             )
 
 
-def _find_unpublished(topic: Topic, graph: Graph) -> Finding:
+def _find_unpublished(topic: Topic, graph: Graph) -> CheckResult:
     last = topic.name.rpartition("/")[2]
     same = [
         name
@@ -207,7 +207,7 @@ def _find_unpublished(topic: Topic, graph: Graph) -> Finding:
 
 def _check_qualities(
     topic: Topic, senders: list[Endpoint], listeners: list[Endpoint]
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     for sender in senders:
         for listener in listeners:
             refused = [
@@ -244,7 +244,7 @@ def _check_qualities(
             )
 
 
-def check_parameters(graph: Graph, config: str) -> list[Finding]:
+def check_parameters(graph: Graph, config: str) -> list[CheckResult]:
     """Check whether the nodes answer parameter requests, and use the configuration given here."""
     found = []
     for name, values in graph.parameters.items():
@@ -270,7 +270,7 @@ def check_parameters(graph: Graph, config: str) -> list[Finding]:
     return found
 
 
-def check_simulated_time(graph: Graph) -> list[Finding]:
+def check_simulated_time(graph: Graph) -> list[CheckResult]:
     """Check whether /clock and the parameters `use_sim_time` are consistent."""
     clocks = [e.node for e in graph.publishers.get(_CLOCK, ())]
     known = {name: values[0] for name, values in graph.parameters.items() if values is not None}

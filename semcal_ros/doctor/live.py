@@ -45,8 +45,8 @@ from semcal_ros.doctor.observations import (
     Arrival,
     Endpoint,
     Graph,
+    NodeStatus,
     Session,
-    Status,
 )
 from semcal_ros.doctor.stream_checks import describe_image
 from semcal_ros.middleware.message_types import message_class
@@ -117,7 +117,7 @@ class _Observer:
         self._stage: Any = None
         self._conditions: dict[str, float | str] | None = None
         self._calibration: str | None = None
-        self._statuses: dict[str, Status] = {}
+        self._statuses: dict[str, NodeStatus] = {}
         images, magnification = topics[:2]
         # What to do with a message, by topic, in addition to recording its arrival.
         self._takes: dict[str, Callable[[Any], None]] = {
@@ -228,7 +228,7 @@ class _Observer:
             name = status.name.removesuffix(": stream")
             if name != status.name and name.rpartition("/")[0] == self._namespace:
                 level = int.from_bytes(status.level, "little")
-                self._statuses[name] = Status(name, level, status.message)
+                self._statuses[name] = NodeStatus(name, level, status.message)
 
     def _reading(self) -> tuple[MagnificationReading | None, str]:
         if self._magnification is None:

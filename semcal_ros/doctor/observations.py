@@ -175,7 +175,7 @@ class CalibrationSeen:
 
 
 @dataclass(frozen=True)
-class Status:
+class NodeStatus:
     """The last diagnostics of a node: level as in diagnostic_msgs (0 OK, 1 WARN, 2 ERROR, 3 STALE), and its message."""
 
     node: str
@@ -219,4 +219,4 @@ class Session:
     stage_trouble: str = ""
     conditions: Mapping[str, float | str] | None = None
     calibration_text: str | None = None
-    statuses: tuple[Status, ...] = ()
+    statuses: tuple[NodeStatus, ...] = ()

@@ -31,7 +31,7 @@ from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import MessageError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import judge_calibrations
-from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.graph_checks import CONDITIONS, Topic, suite_topics
 from semcal_ros.doctor.observations import Arrival, Endpoint, Graph, Session
 from semcal_ros.doctor.stream_checks import (
@@ -51,7 +51,7 @@ _ENCAPSULATION = 4
 _NS_PER_S = 1_000_000_000  # nanoseconds per second
 
 
-def diagnose_recording(path: Path, config_name: str, calibration: Path | None) -> list[Finding]:
+def diagnose_recording(path: Path, config_name: str, calibration: Path | None) -> list[CheckResult]:
     """Check what a recording holds, and return the findings.
 
     Parameters
@@ -113,7 +113,7 @@ def _find_namespace(bag: BagReader, config: MicroscopeConfig) -> str:
     return "/sem"
 
 
-def _check_presence(topic: Topic, types: dict[str, str]) -> Finding:
+def _check_presence(topic: Topic, types: dict[str, str]) -> CheckResult:
     kind = types.get(topic.name)
     if kind == topic.type:
         return ok(topic.name, f"{kind} in {_RECORDING}")

@@ -30,7 +30,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import describe_condition
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.core.wording import counted
-from semcal_ros.doctor.findings import Finding, note, ok, problem
+from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic
 from semcal_ros.doctor.observations import Arrival, ImageSeen, Session
 from semcal_ros.files.images.databar import DatabarCutter
@@ -84,7 +84,7 @@ def _format_rate(arrivals: tuple[Arrival, ...]) -> str:
     return "one" if rate is None else f"{rate:.3g} Hz"
 
 
-def check_images(topic: Topic, session: Session) -> list[Finding]:
+def check_images(topic: Topic, session: Session) -> list[CheckResult]:
     """Check whether usable images arrive; empty without a publisher, which another check reports."""
     if not session.graph.publishers.get(topic.name):
         return []
@@ -107,7 +107,9 @@ def check_images(topic: Topic, session: Session) -> list[Finding]:
     return [ok("images", seen)]
 
 
-def check_large_images(session: Session, environment: Mapping[str, str], rmw: str) -> list[Finding]:
+def check_large_images(
+    session: Session, environment: Mapping[str, str], rmw: str
+) -> list[CheckResult]:
     """Check whether this shell's environment suits the images; the nodes report theirs in their diagnostics."""
     if session.image is None:
         return []
@@ -140,7 +142,7 @@ def describe_magnifications(session: Session, config: MicroscopeConfig) -> Magni
 
 def check_magnification(
     topic: Topic, seen: MagnificationSeen | None, session: Session
-) -> list[Finding]:
+) -> list[CheckResult]:
     """Check whether a magnification is known."""
     if not session.graph.publishers.get(topic.name):
         return []
@@ -158,7 +160,7 @@ def check_magnification(
     return [ok("magnification", f"{seen.value:g}")]
 
 
-def check_stage(topic: Topic, session: Session, config: MicroscopeConfig) -> list[Finding]:
+def check_stage(topic: Topic, session: Session, config: MicroscopeConfig) -> list[CheckResult]:
     """Check whether the stage says its angles; empty without a publisher of the right type."""
     senders = session.graph.publishers.get(topic.name, ())
     if config.stage is None or not any(sender.type == topic.type for sender in senders):
@@ -187,7 +189,7 @@ def check_stage(topic: Topic, session: Session, config: MicroscopeConfig) -> lis
     return [ok("stage", _format_angles(session.stage))]
 
 
-def check_conditions(topic: Topic, session: Session) -> list[Finding]:
+def check_conditions(topic: Topic, session: Session) -> list[CheckResult]:
     """Check whether the microscope says its conditions; empty without a publisher of the right type."""
     senders = session.graph.publishers.get(topic.name, ())
     if not any(sender.type == topic.type for sender in senders):
@@ -223,7 +225,7 @@ def _format_angles(stage: StageReading) -> str:
     return ", ".join(f"{name} {math.degrees(a):.1f} degrees" for name, a in angles if a is not None)
 
 
-def check_stamps(topic: Topic, session: Session) -> list[Finding]:
+def check_stamps(topic: Topic, session: Session) -> list[CheckResult]:
     """Check whether stamps are set, advance, and are of this clock."""
     arrivals = [a for a in session.arrivals.get(topic.name, ()) if a.stamp_ns is not None]
     stamps = [a.stamp_ns for a in arrivals if a.stamp_ns is not None]
@@ -255,7 +257,7 @@ def check_stamps(topic: Topic, session: Session) -> list[Finding]:
     return [*found, _check_age(age_s, bool(session.graph.publishers.get("/clock")))]
 
 
-def _check_age(age_s: float, replay: bool) -> Finding:
+def _check_age(age_s: float, replay: bool) -> CheckResult:
     if abs(age_s) > _OTHER_CLOCK_S:
         seen = f"stamps are {abs(age_s) / 3600:.3g} h {'old' if age_s > 0 else 'in the future'}: from another clock"
         if replay:
@@ -282,7 +284,7 @@ def _check_age(age_s: float, replay: bool) -> Finding:
     return ok("stamps", f"frames are {1e3 * age_s:.3g} ms old when they arrive")
 
 
-def check_transport_time(topic: Topic, session: Session) -> list[Finding]:
+def check_transport_time(topic: Topic, session: Session) -> list[CheckResult]:
     """Check, by the apparent transport time, whether the clocks of the publisher's host and of this one agree."""
     times = [
         (a.received_ns - a.published_ns) * 1e-9
@@ -312,7 +314,7 @@ def check_transport_time(topic: Topic, session: Session) -> list[Finding]:
     return [ok("clocks", f"images take {1e3 * median(times):.3g} ms from publisher to here")]
 
 
-def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Finding]:
+def check_output_rate(source: Topic, output: Topic, session: Session) -> list[CheckResult]:
     """Check whether an output keeps up with the images."""
     taken, made = session.arrivals.get(source.name, ()), session.arrivals.get(output.name, ())
     senders = session.graph.publishers.get(output.name, ())
@@ -340,7 +342,7 @@ def check_output_rate(source: Topic, output: Topic, session: Session) -> list[Fi
     return [ok(output.name, seen)]
 
 
-def check_diagnostics(session: Session, namespace: str) -> list[Finding]:
+def check_diagnostics(session: Session, namespace: str) -> list[CheckResult]:
     """Report the diagnostics of the suite's nodes."""
     found = []
     for status in session.statuses:

@@ -517,7 +517,7 @@ class _BagRecording(Recording):
                 pixels, _ = decoded_image(self._reader.decode(raw))
             except SemcalError:
                 continue
-            finder.look(pixels)
+            finder.find_rows(pixels)
             if finder.rows is not None:
                 break
         if finder.candidate:

@@ -32,8 +32,6 @@ from semcal_ros.nodes.calibration_server import CalibrationServer
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 
-__all__ = ["run_acquisition"]
-
 # As long as a slow scan may take, and the middleware to find a microscope.
 _FIRST_PICTURE_S = 60.0
 _POLL_S = 0.1
@@ -69,16 +67,15 @@ class _Acquirer(CalibrationServer):
         self._tell_end()
 
     def _tell_end(self) -> None:
-        if self._told_end or self.recording is None:
+        if self._told_end or self.acquisition.recording is None:
             return
         self._told_end = True
-        if self.acquisition_progress.state == "done":
-            self._say(f"all pictures: {self.recording}")
-        elif self.recording.exists():
-            unit = "view" if self._acquisition is None else self._acquisition.unit
-            views = counted(self.acquisition_progress.views, unit)
+        if self.acquisition.progress.state == "done":
+            self._say(f"all pictures: {self.acquisition.recording}")
+        elif self.acquisition.recording.exists():
+            views = counted(self.acquisition.progress.views, self.acquisition.unit)
             self._say(
-                f"ended with {views}; the same command with --resume {self.recording} goes on"
+                f"ended with {views}; the same command with --resume {self.acquisition.recording} goes on"
             )
 
     def show(self, progress: Progress) -> None:
@@ -108,12 +105,16 @@ class _Acquirer(CalibrationServer):
                 )
             time.sleep(_POLL_S)
         with self._begins:
-            self._say(self.extend() if self.parameters["extend_to"] > 0.0 else self.acquire())
+            self._say(
+                self.acquisition.extend()
+                if self.parameters["extend_to"] > 0.0
+                else self.acquisition.acquire()
+            )
 
     def _follow(self) -> None:
         asked = ""
-        while self.acquiring:
-            progress = self.acquisition_progress
+        while self.acquisition.is_running:
+            progress = self.acquisition.progress
             if progress.state == "waiting" and progress.text != asked:
                 asked = progress.text
                 self._ask(f"{progress.views}/{progress.planned}: {progress.text}, then press Enter")
@@ -123,12 +124,12 @@ class _Acquirer(CalibrationServer):
                     self._say(f"not taken: {error}")
                     asked = ""
             time.sleep(_POLL_S)
-        progress = self.acquisition_progress
+        progress = self.acquisition.progress
         self._say(progress.text)
         self._tell_end()
         if self.has_calibration:
             self._say(self.save())
-        if self.acquisition_reached:
+        if self.acquisition.reached:
             self.exit_status = 0
 
 

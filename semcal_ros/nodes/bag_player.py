@@ -42,8 +42,6 @@ from semcal_ros.nodes.common.publisher import PatientPublisher
 from semcal_ros.nodes.common.qos import overridable, service_queue, stream_output, value_input
 from semcal_ros.nodes.common.run import run_node
 
-__all__ = ["BagPlayer", "main"]
-
 
 class _Pacer:
     """Position in a recording that advances with a wall clock; wall times are arguments.

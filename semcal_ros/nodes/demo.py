@@ -31,8 +31,6 @@ from std_msgs.msg import Float64
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.viewer import Viewer, give_way
 
-__all__ = ["DEMO_MAGNIFICATIONS", "run_demo"]
-
 #: Magnifications that the knob goes through, up and down.
 DEMO_MAGNIFICATIONS = (2000.0, 3000.0, 5000.0, 8000.0)
 # Long enough for the drift to be known well at each of them.

@@ -18,15 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.compressed import compressed_parameters
-from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, LiveDrift
-from semcal_ros.nodes.frames.outputs import DriftOutput, ImageOutput
+from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, DriftCorrection
+from semcal_ros.nodes.frames.outputs import ImageOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode, nominal_camera
-
-__all__ = ["DriftCompensator", "main"]
 
 
 class DriftCompensator(StreamNode):
@@ -40,37 +37,26 @@ class DriftCompensator(StreamNode):
             "drift_compensator",
             (INTERPOLATION, *DRIFT_PARAMETERS, *compressed_parameters("image_stabilized")),
         )
-        self._rectifier = Rectifier(self.parameters["interpolation"])
-        self.parameters.on_change("interpolation", self._set_interpolation)
         # Closed in the reverse order, so that the last compressed image is published.
-        self._images = ImageOutput(
-            self.parameters, self.endpoints, self.reporter, "image_stabilized"
-        )
+        self._images = ImageOutput(self.node_context, "image_stabilized")
         self.closing.callback(self._images.close)
-        self._drift = LiveDrift(self.config, self.parameters, self.endpoints, self.reporter)
-        self.closing.callback(self._drift.close)
-        self._drifts = DriftOutput(self.endpoints, self.reporter)
+        self._correction = DriftCorrection(self.node_context, self.closing)
         self.receive_frames(self._on_frame)
-
-    def _set_interpolation(self, value: str) -> None:
-        self._rectifier = Rectifier(value)
 
     def _on_frame(self, frame: StreamFrame) -> None:
         g = self.known_magnification(frame)
         if g is None:
             return
-        camera = nominal_camera(g, *frame.size, self.config.display_width_m)
-        drift = None if frame.mixed else self._drift.estimate(frame, camera)
-        raster = None if drift is None else drift.raster
-        memory = self._images.memory(frame)
-        self._rectifier.rectify(frame.image, camera, raster, self.config.scan, out=memory)
-        self._images.publish(frame)
-        if drift is not None:
-            self._drifts.publish(drift, frame)
+        self._correction.correct(
+            frame,
+            nominal_camera(g, *frame.size, self.config.display_width_m),
+            self._images,
+            lambda _drift: self._images.publish(frame),
+        )
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report whether the drift is only predicted."""
-        return super().conditions() + [self._drifts.trouble] * bool(self._drifts.trouble)
+        return super().conditions() + self._correction.conditions()
 
 
 def main(args: Sequence[str] | None = None) -> int:

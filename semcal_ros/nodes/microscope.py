@@ -41,8 +41,6 @@ from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.source_output import SourceOutput
 
-__all__ = ["Microscope", "main"]
-
 _PARAMETERS = (
     ParameterDeclaration(
         "source", "folder", "What the frames come from.", choices=tuple(SOURCES), fixed=True
@@ -204,9 +202,7 @@ class Microscope(SemNode):
         self._source_name = name
         stage = name != "video"
         self._output = SourceOutput(
-            self.config,
-            self.endpoints,
-            self.reporter,
+            self.node_context,
             stage=stage,
             magnification=self.parameters["publish_magnification"],
         )
@@ -226,9 +222,7 @@ class Microscope(SemNode):
         self.closing.callback(self._runner.close)
         self.closing.callback(self._finish_probe)
         self._hands = _Hands(self, self._source, self._runner)
-        self._motion = MotionInterface(
-            self, self.endpoints, self.parameters, self.reporter, self.config.stage, self._hands
-        )
+        self._motion = MotionInterface(self.node_context, self._hands)
         self._controls = [
             self.endpoints.trigger_service("~/start", self._start),
             self.endpoints.trigger_service("~/stop", self._stop),

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -30,8 +31,12 @@ from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.bridge.projection import fill_projection, fill_projection_covariance
-from semcal_ros.core.errors import InvalidValueError, SemcalError
+from semcal_ros.bridge.static_frames import StaticFrame, fill_static_frames, static_frames
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import ConfigError, InvalidValueError, SemcalError
+from semcal_ros.middleware.message_types import message_class
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.parameters import (
     CALIBRATION,
     REPLAYED_CALIBRATION,
@@ -42,12 +47,9 @@ from semcal_ros.nodes.frames.calibration_input import CalibrationInput
 from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.frames.static_frames import StaticFramesOutput
 
 if TYPE_CHECKING:
     from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
-
-__all__ = ["ParameterServer", "main"]
 
 _SIZE = (
     ParameterDeclaration(
@@ -75,6 +77,39 @@ _TICK_S = 0.5
 _WATCH_S = 0.5
 
 
+class StaticFramesOutput:
+    """The topic ``/tf_static``, which begins with the microscope's frames and is renewed when one of them changes.
+
+    Parameters
+    ----------
+    context
+        Of the node; its configuration names the frame of the images, and says how the stage is turned.
+    """
+
+    def __init__(self, context: NodeContext) -> None:
+        self._config = context.config
+        self._clock = context.node.get_clock()
+        self._published: tuple[StaticFrame, ...] = ()
+        self._new_message: Any = None
+        try:
+            self._new_message = message_class("tf2_msgs/msg/TFMessage")
+        except ConfigError:
+            # tf2 is not on PyPI, and who has no tf2 needs no frames.
+            return
+        self._publisher = context.endpoints.latched_publisher(self._new_message, "/tf_static")
+        self.publish(None)
+
+    def publish(self, camera: ScanCamera | None) -> None:
+        """Tell the frames of a camera, if they are others than before."""
+        frames = static_frames(self._config, camera)
+        if self._new_message is None or frames == self._published:
+            return
+        self._published = frames
+        message = self._new_message()
+        fill_static_frames(message, frames, self._clock.now().nanoseconds, TransformStamped)
+        self._publisher.publish(message)
+
+
 class ParameterServer(SemNode):
     """Publishes ``calibration``, ``camera_info``, ``projection`` and its covariance; answers ``p@5250`` and the like.
 
@@ -96,31 +131,19 @@ class ParameterServer(SemNode):
         self._covariance = self.endpoints.latched_publisher(
             Float64MultiArray, "projection_covariance"
         )
-        self._frames = StaticFramesOutput(self.config, self.endpoints, self.get_clock())
-        self._calibration = CalibrationInput(
-            self.config,
-            self.parameters,
-            self.endpoints,
-            self.reporter,
-            on_change=self._on_calibration,
-        )
-        self._watch = ConditionsWatch(
-            self.endpoints, self.reporter, lambda: self._calibration.current
-        )
+        self._frames = StaticFramesOutput(self.node_context)
+        self._calibration = CalibrationInput(self.node_context, on_change=self._on_calibration)
+        self._watch = ConditionsWatch(self.node_context, lambda: self._calibration.current)
         for setting in _SIZE:
             self.parameters.on_change(setting.name, lambda _value: self._refresh())
-        self._magnification = MagnificationInput(
-            self.config, self.endpoints, self.reporter, self._on_reading
-        )
+        self._magnification = MagnificationInput(self.node_context, self._on_reading)
         self._monitor: CalibrationMonitor | None = None
         if self.parameters[_MONITOR_PERIOD.name] > 0.0:
             # What finds grids and checks calibrations is twice as large as the rest of the node.
             from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor
 
             self._monitor = CalibrationMonitor(
-                self.config,
-                self.endpoints,
-                self.reporter,
+                self.node_context,
                 self._magnification,
                 lambda: (self._calibration.current, self._calibration.config),
                 self.parameters[_MONITOR_PERIOD.name],

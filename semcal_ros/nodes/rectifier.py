@@ -23,8 +23,6 @@ from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
 from semcal_ros.nodes.frames.stream import StreamFrame
 
-__all__ = ["RectifierNode", "main"]
-
 _INPUT = ParameterDeclaration(
     "input",
     "raw",
@@ -54,7 +52,7 @@ class RectifierNode(CalibratedStreamNode):
             if g is None:
                 return
             camera = self.camera(frame, g)
-        self.rectifier.rectify(frame.image, camera, out=self.output.memory(frame))
+        self.output.render(frame, camera)
         self.publish(camera, frame)
 
 

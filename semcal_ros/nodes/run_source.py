@@ -24,8 +24,6 @@ from semcal_ros.nodes.common.run import run_node, run_parts
 from semcal_ros.nodes.microscope import Microscope
 from semcal_ros.nodes.suite import Suite
 
-__all__ = ["run_source", "run_suite"]
-
 
 def run_source(
     make: Callable[[MicroscopeConfig], FrameSource], args: Sequence[str] | None = None

@@ -21,19 +21,6 @@ import signal
 from collections.abc import Callable
 from importlib import import_module
 
-__all__ = [
-    "bag_player",
-    "calibration_server",
-    "drift_compensator",
-    "microscope",
-    "parameter_server",
-    "rectifier",
-    "stream_corrector",
-    "suite",
-    "virtual_sem",
-    "visual_servo",
-]
-
 
 def _starter(name: str) -> Callable[[], int]:
     def start() -> int:

@@ -20,11 +20,8 @@ from collections.abc import Sequence
 
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, LiveDrift
-from semcal_ros.nodes.frames.outputs import DriftOutput
+from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, DriftCorrection
 from semcal_ros.nodes.frames.stream import StreamFrame, nominal_camera
-
-__all__ = ["StreamCorrector", "main"]
 
 
 class StreamCorrector(CalibratedStreamNode):
@@ -35,14 +32,12 @@ class StreamCorrector(CalibratedStreamNode):
 
     def __init__(self) -> None:
         super().__init__("stream_corrector", DRIFT_PARAMETERS)
-        self._drift = LiveDrift(self.config, self.parameters, self.endpoints, self.reporter)
-        self.closing.callback(self._drift.close)
-        self._drifts = DriftOutput(self.endpoints, self.reporter)
+        self.correction = DriftCorrection(self.node_context, self.closing)
         self.receive_frames(self._on_frame)
 
     def on_calibration(self) -> None:
         """Reset the drift: a keyframe in the coordinates of the old calibration is useless."""
-        self._drift.reset()
+        self.correction.tracking.reset()
 
     def _on_frame(self, frame: StreamFrame) -> None:
         g = self.known_magnification(frame)
@@ -50,18 +45,16 @@ class StreamCorrector(CalibratedStreamNode):
             return
         camera = self.camera(frame, g)
         width_m = self.calibration.config.display_width_m
-        used = camera or nominal_camera(g, *frame.size, width_m)
-        drift = None if frame.mixed else self._drift.estimate(frame, used)
-        raster = None if drift is None else drift.raster
-        memory = self.output.memory(frame)
-        self.rectifier.rectify(frame.image, used, raster, self.config.scan, out=memory)
-        self.publish(camera, frame, drift)
-        if drift is not None:
-            self._drifts.publish(drift, frame)
+        self.correction.correct(
+            frame,
+            camera or nominal_camera(g, *frame.size, width_m),
+            self.output,
+            lambda drift: self.publish(camera, frame, drift),
+        )
 
     def conditions(self) -> list[str]:
         """Extend the base class: also report whether the drift is only predicted."""
-        return super().conditions() + [self._drifts.trouble] * bool(self._drifts.trouble)
+        return super().conditions() + self.correction.conditions()
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -33,8 +33,6 @@ from semcal_ros.nodes.parameter_server import ParameterServer
 from semcal_ros.nodes.stream_corrector import StreamCorrector
 from semcal_ros.nodes.virtual_sem import VirtualSem
 
-__all__ = ["Suite", "main"]
-
 MakeSource = Callable[[MicroscopeConfig], FrameSource]
 
 _PARAMETERS = (

@@ -69,8 +69,6 @@ from semcal_ros.viewer.state import (
     drift_in_pixels,
 )
 
-__all__ = ["Viewer", "give_way", "run_viewer"]
-
 _PARAMETERS = (
     CALIBRATION,
     REPLAYED_CALIBRATION,
@@ -177,13 +175,11 @@ class Viewer(SemNode):
         self._wanted: list[tuple[str, Any, Any, Future[Any]]] = []
         self._graph_s = self._status_s = 0.0
         self._magnification: float | None = None
-        self.calibration = CalibrationInput(
-            self.config, self.parameters, self.endpoints, self.reporter
-        )
-        self._magnifications = MagnificationInput(self.config, self.endpoints, self.reporter)
-        self._conditions = ConditionsInput(self.endpoints, self.reporter)
+        self.calibration = CalibrationInput(self.node_context)
+        self._magnifications = MagnificationInput(self.node_context)
+        self._conditions = ConditionsInput(self.node_context)
         self._polled = group = PolledGroup()
-        self._images = ViewedImages(self.config, self.endpoints, group)
+        self._images = ViewedImages(self.node_context, group)
         listen = [
             (PoseWithCovarianceStamped, "drift", stream_output(100), self._on_drift),
             (TwistWithCovarianceStamped, "drift_velocity", stream_output(1), self._on_velocity),

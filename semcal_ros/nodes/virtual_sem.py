@@ -64,8 +64,6 @@ from semcal_ros.synthetic import (
 )
 from semcal_ros.synthetic.pose import rotation_about_beam
 
-__all__ = ["VirtualSem", "main"]
-
 _PARAMETERS = (
     replace(CONFIG, default="virtual_sem"),
     ParameterDeclaration("preset", "jsm820", "Microscope.", choices=tuple(PRESETS), fixed=True),
@@ -268,9 +266,7 @@ class VirtualSem(SemNode):
         for name in ("voltage_v", "working_distance_m"):
             self.parameters.on_change(name, lambda _value: self._announce_conditions())
         self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
-        self._motion = MotionInterface(
-            self, self.endpoints, self.parameters, self.reporter, self.config.stage, self
-        )
+        self._motion = MotionInterface(self.node_context, self)
         self._controls = [
             self.endpoints.trigger_service("~/start", self._start),
             self.endpoints.trigger_service("~/stop", self._stop),

@@ -16,12 +16,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
@@ -38,16 +40,17 @@ from semcal_ros.applications.servoing import (
     choose_projection,
     find_target,
 )
+from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
+from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.magnification import MagnificationReading
+from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
-from semcal_ros.nodes.servo.output import ErrorOutput, StageOutput
 from semcal_ros.nodes.servo.parameters import SERVO_PARAMETERS, read_goal, read_servo_settings
-
-__all__ = ["VisualServo", "main"]
 
 # Period of the watchdog: a fifth of the shortest silence that it has to notice.
 _TICK_S = 0.1
@@ -62,6 +65,69 @@ _HIDDEN = 0.03
 # Least time between two resets while the target is still found, in addition to two frame intervals:
 # frames corrected before a reset still arrive with the old drift. Chosen, not measured.
 _RESET_AGAIN_S = 2.0
+
+
+# Longest wait for the acknowledgement of the final zero velocity: a stage that is gone must not
+# hold up the end of the node. Chosen, not measured.
+_LAST_WORD_S = 1.0
+
+
+class StageOutput:
+    """Publishes velocities of the stage; the last one is zero.
+
+    Parameters
+    ----------
+    endpoints, topic
+        Where to publish.
+    """
+
+    def __init__(self, endpoints: Endpoints, topic: str) -> None:
+        self._publisher = endpoints.stream_publisher(Twist, topic)
+        self.twist = np.zeros(3)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the last velocity was not zero."""
+        return bool(np.any(self.twist))
+
+    def send(self, twist: Array) -> None:
+        """Publish (3,): x, y in m/s, rotation in rad/s."""
+        message = Twist()
+        message.linear.x, message.linear.y, message.angular.z = (float(v) for v in twist)
+        self._publisher.publish(message)
+        self.twist = np.array(twist)
+
+    def repeat(self) -> None:
+        """Publish the last velocity once more."""
+        self.send(self.twist)
+
+    def close(self) -> None:
+        """Stop the stage and wait until it has received the zero velocity."""
+        self.send(np.zeros(3))
+        self._publisher.wait_for_all_acked(Duration(seconds=_LAST_WORD_S))
+
+
+class ErrorOutput:
+    """Publishes ``~/error``: target minus goal, in the sem frame, at the centre of a frame."""
+
+    def __init__(self, endpoints: Endpoints) -> None:
+        self._publisher = endpoints.stream_publisher(PoseWithCovarianceStamped, "~/error")
+
+    def publish(self, step: ServoStep, header: Any) -> None:
+        """Publish the measured error; nothing if nothing was measured."""
+        if not np.all(np.isfinite(step.error_covariance)):
+            return
+        message = PoseWithCovarianceStamped()
+        copy_header(message.header, header)
+        pose = message.pose.pose
+        x, y, turn = (float(v) for v in step.error)
+        pose.position.x, pose.position.y = x, y
+        pose.orientation.z, pose.orientation.w = math.sin(0.5 * turn), math.cos(0.5 * turn)
+        full = np.diag(np.full(6, UNKNOWN_VARIANCE))
+        known = np.ix_((0, 1, 5), (0, 1, 5))
+        full[known] = step.error_covariance
+        message.pose.covariance = full.reshape(-1).tolist()
+        self._publisher.publish(message)
 
 
 class VisualServo(SemNode):
@@ -100,12 +166,9 @@ class VisualServo(SemNode):
         self._reset = None
         if values["reset_service"] and values["goal_frame"] == "instrument":
             self._reset = self.create_client(Trigger, values["reset_service"])
-        self._magnification = MagnificationInput(
-            self.config, self.endpoints, self.reporter, self._on_magnification
-        )
+        self._magnification = MagnificationInput(self.node_context, self._on_magnification)
         self._input = ServoInput(
-            self.endpoints,
-            self.reporter,
+            self.node_context,
             self._on_frame,
             self._halt,
             with_drift=bool(values["with_drift"]),

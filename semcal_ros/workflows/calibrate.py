@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -27,7 +28,12 @@ from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.method_fit import Finding
-from semcal_ros.core.calibration.options import CalibrationOptions, MethodOptions
+from semcal_ros.core.calibration.options import (
+    METHODS,
+    RESIDUAL_MODES,
+    CalibrationOptions,
+    MethodOptions,
+)
 from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, are_enough, calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import (
@@ -54,6 +60,8 @@ from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import (
+    PATTERN,
+    UNTILTED,
     CollectedViews,
     collect_views,
     find_views,
@@ -70,20 +78,22 @@ from semcal_ros.workflows.inputs import (
     open_source,
     resolve_config,
 )
+from semcal_ros.workflows.options import (
+    CONFIG,
+    DASK,
+    MAGNIFICATION,
+    PROGRESS,
+    SQUARES,
+    Keyword,
+    KeywordsOf,
+    Option,
+)
 from semcal_ros.workflows.provenance import (
     describe_computation,
     describe_provenance,
     sum_up_conditions,
 )
 from semcal_ros.workflows.workers import open_workers
-
-__all__ = [
-    "RecordingCalibration",
-    "calibrate",
-    "calibrate_found",
-    "calibrate_recording",
-    "options_for",
-]
 
 # A display width that is wrong by more than this factor is worth a warning.
 _SCALE_WARNING = 1.25
@@ -349,32 +359,107 @@ def calibrate_found(
     return RecordingCalibration(Calibration.from_model(model), result, collected)
 
 
+#: Of the fields of core's :class:`~semcal_ros.core.calibration.options.MethodOptions`.
+PAPER_OPTIONS = {
+    "pda_order": Option("pda: order of the differential equations.", between=(1, 4)),
+    "legendre_degree": Option(
+        "pda: fit Legendre polynomials of this degree instead of an ODE.",
+        names=("--legendre",),
+        between=(0, 20),
+    ),
+    "pda_step": Option(
+        "pda: fit through magnifications G apart; auto tries all steps and takes that of the least error.",
+        kind="step",
+    ),
+    "tau_px": Option("Algorithm 1: fixed threshold in px instead of a statistical test."),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """What is known of the grid, and how the calibration is made from it."""
+
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    display_width_m: Annotated[
+        float | None, Keyword("In place of that of the configuration, m.")
+    ] = None
+    magnification: Annotated[float | None, MAGNIFICATION] = None
+    squares_m: Annotated[Sequence[float] | None, SQUARES] = None
+    pattern: Annotated[str, PATTERN] = "auto"
+    untilted: Annotated[str | Sequence[str | int], UNTILTED] = "auto"
+    method: Annotated[
+        str,
+        Option("One adjustment over everything, or the ways of the paper.", choices=tuple(METHODS)),
+    ] = CalibrationOptions.method
+    options: Annotated[MethodOptions | None, Keyword("Options of the paper's methods.")] = None
+    breakpoints: Annotated[
+        Sequence[float],
+        Option(
+            "joint: where the microscope switches its scan range, so that the scale jumps.",
+            kind="numbers",
+        ),
+    ] = ()
+    residual: Annotated[
+        str,
+        Option(
+            "joint: whether to add a field for what the distortion parameters cannot describe.",
+            choices=tuple(RESIDUAL_MODES),
+        ),
+    ] = CalibrationOptions.residual
+    squares_sigma: Annotated[
+        float | None,
+        Option(
+            "Relative 1-sigma of the grid's squares, such as 0.001, instead of that of the configuration.",
+            between=(0.0, 0.1),
+        ),
+    ] = None
+    height_sigma_m: Annotated[
+        float,
+        Option(
+            "1-sigma of the height of what is measured later above or below the untilted grid.",
+            kind="length or 0",
+            python="In m.",
+        ),
+    ] = CalibrationOptions.height_sigma_m
+    dask: Annotated[str | None, DASK] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+    def of_core(self) -> CalibrationOptions:
+        """Return what core calls options; raises :class:`InvalidValueError`."""
+        untilted = self.untilted
+        return CalibrationOptions(
+            self.method,
+            self.options or MethodOptions(),
+            check_positives(self.breakpoints, "breakpoints"),
+            self.residual,
+            untilted if isinstance(untilted, str) else tuple(str(name) for name in untilted),
+            height_sigma_m=self.height_sigma_m,
+        )
+
+    def configuration(self) -> MicroscopeConfig:
+        """Return the configuration, with what the options say in its place; raises :class:`SemcalError`."""
+        chosen = resolve_config(self.config)
+        if self.display_width_m is not None:
+            width_m = check_positive(self.display_width_m, "display_width_m")
+            chosen = replace(chosen, display_width_m=width_m)
+        if self.squares_m is not None:
+            chosen = replace(chosen, squares_m=check_positives(self.squares_m, "squares_m"))
+        if self.squares_sigma is not None:
+            chosen = replace(chosen, squares_sigma=self.squares_sigma)
+        return chosen
+
+
 def calibrate_recording(
-    source: Source,
-    *,
-    config: ConfigSource | None = None,
-    display_width_m: float | None = None,
-    squares_m: Sequence[float] | None = None,
-    squares_sigma: float | None = None,
-    magnification: float | None = None,
-    options: CalibrationOptions | None = None,
-    pattern: str = "auto",
-    keep_images: bool = True,
-    dask: str | None = None,
-    on_progress: OnProgress = ignore_progress,
+    source: Source, asked: CalibrateOptions | None = None, *, keep_images: bool = True
 ) -> RecordingCalibration:
     """Calibrate, and keep the views and residuals that a report shows.
 
     Parameters and errors are those of :func:`calibrate`. Without ``keep_images`` the images of the
     views do not stay in memory, and a report shows none.
     """
-    chosen = resolve_config(config)
-    if display_width_m is not None:
-        chosen = replace(chosen, display_width_m=check_positive(display_width_m, "display_width_m"))
-    if squares_m is not None:
-        chosen = replace(chosen, squares_m=check_positives(squares_m, "squares_m"))
-    if squares_sigma is not None:
-        chosen = replace(chosen, squares_sigma=squares_sigma)
+    asked = asked or CalibrateOptions()
+    options, chosen = asked.of_core(), asked.configuration()
+    on_progress = asked.on_progress
 
     def show_stage(name: str, _fraction: float) -> None:
         on_progress(f"adjusting: {name}", 0, None)
@@ -385,8 +470,8 @@ def calibrate_recording(
         frames[name] = replace(frame, image=frame.image[:0])
 
     with (
-        open_workers(dask) as workers,
-        open_source(source, chosen, magnification=magnification) as recording,
+        open_workers(asked.dask) as workers,
+        open_source(source, chosen, magnification=asked.magnification) as recording,
     ):
         advance = count_frames(on_progress, "finding corners", recording.frame_count)
         found, rejected = find_views(
@@ -394,7 +479,7 @@ def calibrate_recording(
             on_progress=advance,
             workers=workers if workers.elsewhere else None,
             keep_images=keep_images,
-            pattern=pattern,
+            pattern=asked.pattern,
             on_found=_FirstViews(chosen.display_width_m, chosen.squares_m).add,
         )
         notes, stated = recording.notes, recording.pixel_size_stated
@@ -419,53 +504,13 @@ def calibrate_recording(
     )
 
 
-def calibrate(
-    source: Source,
-    *,
-    config: ConfigSource | None = None,
-    display_width_m: float | None = None,
-    squares_m: Sequence[float] | None = None,
-    squares_sigma: float | None = None,
-    magnification: float | None = None,
-    method: str = "joint",
-    options: MethodOptions | None = None,
-    breakpoints: Sequence[float] = (),
-    residual: str = "auto",
-    untilted: str | Sequence[str | int] = "auto",
-    height_sigma_m: float = CalibrationOptions.height_sigma_m,
-    pattern: str = "auto",
-    dask: str | None = None,
-    on_progress: OnProgress = ignore_progress,
-) -> Calibration:
+@KeywordsOf(CalibrateOptions)
+def calibrate(source: Source, asked: CalibrateOptions) -> Calibration:
     """Calibrate a microscope from a recording or from images in memory.
 
-    Parameters
-    ----------
-    source
-        A bag, a folder of images of the grid, or an iterable of (image, magnification)
-        tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3). Grey levels are
-        processed as float32, float64 too: 24 bits, more than any detector has.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    display_width_m, squares_m, squares_sigma
-        Replace the values of ``config``.
-    magnification
-        Magnification of a folder of ordinary images, which do not contain it.
-    untilted
-        Frames in which the specimen is not tilted, by number or by file name; ``"none"``; or
-        ``"auto"``, which finds them where they can be told. With readings of a stage,
-        ``"auto"`` leaves it to them.
-    method, options, breakpoints, residual, height_sigma_m
-        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`, where ``options``
-        is ``method_options``.
-    pattern
-        What the grid consists of: ``"chess"``, ``"dots"`` (also holes), ``"crosses"``, ``"lines"`` (crossed),
-        ``"grating"`` (parallel lines, turned and not tilted), or ``"auto"``. Of all but chess boards,
-        ``squares_m`` is the distance from one to the next.
-    dask
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers find the corners.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    ``source`` is a bag, a folder of images of the grid, or an iterable of (image, magnification)
+    tuples; images are (h, w) or, in the channel order of OpenCV, (h, w, 3). Grey levels are
+    processed as float32, float64 too: 24 bits, more than any detector has.
 
     Raises
     ------
@@ -485,23 +530,4 @@ def calibrate(
         cal = calibrate("recordings/grid", config="jsm820")
         cal.save("jsm820.yaml")
     """
-    return calibrate_recording(
-        source,
-        config=config,
-        display_width_m=display_width_m,
-        squares_m=squares_m,
-        squares_sigma=squares_sigma,
-        magnification=magnification,
-        options=CalibrationOptions(
-            method,
-            options or MethodOptions(),
-            check_positives(breakpoints, "breakpoints"),
-            residual,
-            untilted if isinstance(untilted, str) else tuple(str(name) for name in untilted),
-            height_sigma_m=height_sigma_m,
-        ),
-        pattern=pattern,
-        keep_images=False,
-        dask=dask,
-        on_progress=on_progress,
-    ).calibration
+    return calibrate_recording(source, asked, keep_images=False).calibration

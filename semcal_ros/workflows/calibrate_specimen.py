@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -39,9 +40,8 @@ from semcal_ros.workflows.inputs import (
     ignore_progress,
     resolve_config,
 )
+from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, KeywordsOf, Option
 from semcal_ros.workflows.provenance import describe_provenance
-
-__all__ = ["KNOWN_SIGMA", "RecordedSpecimenCalibration", "calibrate_specimen"]
 
 #: Relative 1-sigma of a size that is stated without one: what a microscope that was serviced shows.
 KNOWN_SIGMA = 0.01
@@ -68,34 +68,47 @@ class RecordedSpecimenCalibration:
     notes: tuple[str, ...] = ()
 
 
-def calibrate_specimen(
-    source: Source,
-    *,
-    pixel_size: tuple[float, float] | None = None,
-    length: Sequence[float] | None = None,
-    sigma: float = KNOWN_SIGMA,
-    stage_scale: float | None = None,
-    config: ConfigSource | None = None,
-    on_progress: OnProgress = ignore_progress,
-) -> RecordedSpecimenCalibration:
+@dataclass(frozen=True, kw_only=True)
+class SpecimenOptions:
+    """What is known of a specimen: one of three."""
+
+    pixel_size: Annotated[
+        tuple[float, float] | None,
+        Keyword("A known pixel size, m, and the magnification at which it is known."),
+    ] = None
+    length: Annotated[
+        Sequence[float] | None,
+        Option(
+            "--specimen: a known length, such as 4.2um@0,110,80,300,82: in picture 0, from pixel 110,80 to 300,82.",
+            kind="length in picture",
+            python="In m; the number of the picture; x, y, x, y of its ends, px.",
+        ),
+    ] = None
+    sigma: Annotated[
+        float,
+        Option(
+            "--specimen: 1-sigma of the known pixel size or length.",
+            kind="ratio",
+            names=("--known-sigma",),
+        ),
+    ] = KNOWN_SIGMA
+    stage_scale: Annotated[
+        float | None,
+        Option(
+            "--specimen: the moves of the stage are the known lengths, with this 1-sigma, such as 0.5%.",
+            kind="ratio",
+            python="Its x and y are those of the recording or of the files.",
+        ),
+    ] = None
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(SpecimenOptions)
+def calibrate_specimen(source: Source, options: SpecimenOptions) -> RecordedSpecimenCalibration:
     """Calibrate from pictures of a flat, textured specimen, without a grid.
 
-    Parameters
-    ----------
-    source
-        A recording as for :func:`~semcal_ros.workflows.extend.extend`, at three magnifications or more.
-    pixel_size
-        A known pixel size, m, and the magnification at which it is known.
-    length
-        Or a known length, m, the number of a picture, and x, y, x, y of its ends there, px.
-    sigma
-        Relative 1-sigma of the known size.
-    stage_scale
-        Or the relative 1-sigma of the moves of the stage, where its x and y are those of the recording or of the files.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    on_progress
-        Called with the stage, the number of frames or pairs done, and that of all.
+    ``source`` is a recording as for :func:`~semcal_ros.workflows.extend.extend`, at three magnifications or more.
 
     Raises
     ------
@@ -110,7 +123,16 @@ def calibrate_specimen(
         done = calibrate_specimen("recordings/gold", pixel_size=(23.1e-9, 5000.0))
         done.calibration.save("jsm820.yaml")
     """
-    microscope = resolve_config(config)
+    return calibrate_recorded_specimen(source, options)
+
+
+def calibrate_recorded_specimen(
+    source: Source, options: SpecimenOptions
+) -> RecordedSpecimenCalibration:
+    """As :func:`calibrate_specimen`, for options that are an object already."""
+    pixel_size, length, stage_scale = options.pixel_size, options.length, options.stage_scale
+    sigma, on_progress = options.sigma, options.on_progress
+    microscope = resolve_config(options.config)
     if [pixel_size, length, stage_scale].count(None) != 2:
         raise InvalidValueError(
             "not one known size",

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
@@ -35,7 +35,13 @@ from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.calibrate import name_untilted, options_for
 from semcal_ros.workflows.conditions import ConditionsComparison
-from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
+from semcal_ros.workflows.find_grid import (
+    PATTERN_AGAIN,
+    UNTILTED,
+    collect_views,
+    find_views,
+    named_frames,
+)
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
     ConfigSource,
@@ -49,9 +55,8 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.options import CONFIG, PROGRESS, SQUARES, KeywordsOf, Option
 from semcal_ros.workflows.provenance import describe_computation, describe_provenance
-
-__all__ = ["RecordingCheck", "RecordingUpdate", "check", "check_found", "update", "update_found"]
 
 
 @dataclass(frozen=True)
@@ -76,35 +81,36 @@ class RecordingCheck:
     rejections: tuple[RejectedView, ...] = ()
 
 
-def check(
-    calibration: CalibrationSource,
-    source: Source,
-    *,
-    config: ConfigSource | None = None,
-    squares_m: Sequence[float] | None = None,
-    untilted: str | Sequence[str] = "auto",
-    pattern: str = "auto",
-    on_progress: OnProgress = ignore_progress,
-) -> RecordingCheck:
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions:
+    """What the grid is that a calibration is compared with."""
+
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    squares_m: Annotated[Sequence[float] | None, SQUARES] = None
+    pattern: Annotated[str, PATTERN_AGAIN] = "auto"
+    untilted: Annotated[str | Sequence[str], UNTILTED] = "auto"
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdateOptions(CheckOptions):
+    """What the grid is by which a calibration is renewed, and how old the calibration is."""
+
+    ageing: Annotated[
+        float,
+        Option(
+            "1-sigma of a change of the scale since the calibration that the views need not prove.",
+            kind="ratio",
+        ),
+    ] = DEFAULT_AGEING
+
+
+@KeywordsOf(CheckOptions)
+def check(calibration: CalibrationSource, source: Source, options: CheckOptions) -> RecordingCheck:
     """Test views of the grid against a calibration, within the uncertainty of both.
 
-    Parameters
-    ----------
-    calibration
-        A calibration or its file.
-    source
-        A recording of the grid, of one view or more, or (image, magnification) tuples in memory.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    squares_m
-        Sizes of the grid's squares, in place of those of the configuration.
-    untilted
-        Views without tilt, by number or by file name; ``"auto"`` or ``"none"``.
-    pattern
-        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`;
-        ``"auto"`` is a grating where the calibration was made with one.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    ``calibration`` is one or its file; ``source`` a recording of the grid, of one view or more, or
+    (image, magnification) tuples in memory.
 
     Raises
     ------
@@ -120,9 +126,16 @@ def check(
         done = check("jsm820.yaml", "recordings/grid_today")
         done.result.verdict, done.result.changes
     """
+    return check_recording(calibration, source, options)
+
+
+def check_recording(
+    calibration: CalibrationSource, source: Source, options: CheckOptions
+) -> RecordingCheck:
+    """As :func:`check`, for options that are an object already."""
     model = require_calibration(calibration)
-    seen = _see(model, source, config, squares_m, untilted, pattern, on_progress)
-    on_progress("comparing", 0, None)
+    seen = _see(model, source, options)
+    options.on_progress("comparing", 0, None)
     return RecordingCheck(_check(model, seen), len(seen.rejected), seen.notes, seen.rejected)
 
 
@@ -133,7 +146,7 @@ def check_found(
     return _check(calibration, _arrange(found, (), config, config.squares_m, "auto", ()))
 
 
-def _check(model: Calibration, seen: _Seen) -> CalibrationCheck:
+def _check(model: Calibration, seen: _GridRecording) -> CalibrationCheck:
     return check_calibration(
         model, seen.views, image_size=seen.image_size, untilted=seen.untilted, axis=seen.axis
     )
@@ -164,25 +177,13 @@ class RecordingUpdate:
     rejections: tuple[RejectedView, ...] = ()
 
 
+@KeywordsOf(UpdateOptions)
 def update(
-    calibration: CalibrationSource,
-    source: Source,
-    *,
-    config: ConfigSource | None = None,
-    squares_m: Sequence[float] | None = None,
-    untilted: str | Sequence[str] = "auto",
-    pattern: str = "auto",
-    ageing: float = DEFAULT_AGEING,
-    on_progress: OnProgress = ignore_progress,
+    calibration: CalibrationSource, source: Source, options: UpdateOptions
 ) -> RecordingUpdate:
     """Renew a calibration with a few views of the grid; the old one, with its covariance, is the prior.
 
-    Parameters
-    ----------
-    calibration, source, config, squares_m, untilted, pattern, on_progress
-        As for :func:`check`.
-    ageing
-        As for :func:`~semcal_ros.core.calibration.judgement.update.update_calibration`.
+    ``calibration`` and ``source`` are those of :func:`check`.
 
     Raises
     ------
@@ -196,11 +197,19 @@ def update(
         from semcal_ros import update
         update("jsm820.yaml", "recordings/grid_today").calibration.save("jsm820_today.yaml")
     """
+    return update_by_recording(calibration, source, options)
+
+
+def update_by_recording(
+    calibration: CalibrationSource, source: Source, options: UpdateOptions
+) -> RecordingUpdate:
+    """As :func:`update`, for options that are an object already."""
     model = require_calibration(calibration)
-    seen = _see(model, source, config, squares_m, untilted, pattern, on_progress)
-    on_progress("adjusting", 0, None)
+    seen = _see(model, source, options)
+    options.on_progress("adjusting", 0, None)
     used = {view.name: seen.frames[view.name] for view in seen.views}
-    result = _update(model, seen, ageing, describe_provenance(source, seen.config, used))
+    origin = describe_provenance(source, seen.config, used)
+    result = _update(model, seen, options.ageing, origin)
     renewed = Calibration.from_model(result.model)
     return RecordingUpdate(renewed, result, len(seen.rejected), seen.notes, seen.rejected)
 
@@ -217,7 +226,7 @@ def update_found(
 
 
 def _update(
-    model: Calibration, seen: _Seen, ageing: float, provenance: Provenance
+    model: Calibration, seen: _GridRecording, ageing: float, provenance: Provenance
 ) -> CalibrationUpdate:
     result = update_calibration(
         model,
@@ -231,7 +240,7 @@ def _update(
     return replace(result, model=replace(result.model, provenance=provenance))
 
 
-class _Seen(NamedTuple):
+class _GridRecording(NamedTuple):
     """The views of a recording, and what goes with them."""
 
     views: tuple[GridView, ...]
@@ -245,17 +254,10 @@ class _Seen(NamedTuple):
     frames: Mapping[str, RecordedFrame]
 
 
-def _see(
-    model: Calibration,
-    source: Source,
-    config: ConfigSource | None,
-    squares_m: Sequence[float] | None,
-    untilted: str | Sequence[str],
-    pattern: str,
-    on_progress: OnProgress,
-) -> _Seen:
+def _see(model: Calibration, source: Source, options: CheckOptions) -> _GridRecording:
     """Find the grid in a recording."""
-    microscope = resolve_config(config, model)
+    squares_m, untilted, pattern = options.squares_m, options.untilted, options.pattern
+    microscope = resolve_config(options.config, model)
     sizes = microscope.squares_m if squares_m is None else check_positives(squares_m, "squares_m")
     frames: dict[str, RecordedFrame] = {}
     conditions = ConditionsComparison(model)
@@ -265,7 +267,7 @@ def _see(
         frames[name] = replace(frame, image=frame.image[:0])
 
     with open_source(source, microscope) as opened:
-        advance = count_frames(on_progress, "finding corners", opened.frame_count)
+        advance = count_frames(options.on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(
             named_frames(opened, note_frame),
             on_progress=advance,
@@ -284,12 +286,12 @@ def _arrange(
     untilted: str | Sequence[str],
     notes: tuple[str, ...],
     frames: Mapping[str, RecordedFrame] = MappingProxyType({}),
-) -> _Seen:
+) -> _GridRecording:
     """Give found corners their places on the grid."""
     collected = collect_views(
         found, rejected, display_width_m=microscope.display_width_m, squares_m=squares_m
     )
-    return _Seen(
+    return _GridRecording(
         tuple(collected.views),
         collected.image_size,
         name_untilted(untilted, found),

@@ -44,8 +44,6 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 
-__all__ = ["STAGE_ACCURACY", "MovesCheck", "ScaleRatio", "SpecimenCheck", "check_specimen"]
-
 #: Relative 1-sigma of the length of a move along either axis of a stage, and of the right angle between them, where
 #: nothing else is stated. Screws without an encoder are a few tenths of a per cent off over short moves.
 STAGE_ACCURACY = 5e-3

@@ -23,8 +23,6 @@ from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.wording import printable
 from semcal_ros.files.tiff.sem_image import Conditions
 
-__all__ = ["ConditionsComparison"]
-
 # Differences that a note names: those of a recording whose conditions change from frame to frame are no list to read.
 _MOST_NAMED = 4
 

@@ -23,8 +23,6 @@ from typing import Any
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.judgement.plan import judge_calibration
 
-__all__ = ["describe_calibration"]
-
 
 def describe_calibration(calibration: Calibration) -> dict[str, Any]:
     """Return what is known of a calibration, as ``semcal info cal.yaml --json`` prints it; SI units, or None.

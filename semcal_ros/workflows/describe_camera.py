@@ -25,8 +25,6 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.scan_camera import RectifiedCamera, ScanCamera
 from semcal_ros.core.camera.term_sizes import measure_terms
 
-__all__ = ["describe_camera", "parameter_sigma"]
-
 
 def parameter_sigma(camera: ScanCamera) -> dict[str, float]:
     """Return the 1-sigma of each parameter of a calibrated camera."""

@@ -41,14 +41,6 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.provenance import format_date, list_recording_files, sum_up
 
-__all__ = [
-    "GreyLevels",
-    "Intervals",
-    "MagnificationSummary",
-    "RecordingSummary",
-    "describe_recording",
-]
-
 # Of longer recordings, this many images are decoded: pairs of neighbours, evenly spaced. The range of
 # grey levels hardly changes with more, and 200 images of a megapixel take about a second.
 _MOST_DECODED = 200
@@ -239,7 +231,7 @@ def describe_recording(
         [(s.magnification, s.pixel_size_m, s.visits) for s in found.settings]
     """
     microscope = resolve_config(config)
-    seen = _Seen()
+    seen = _RecordingTally()
     try:
         recording = open_source(source, microscope)
     except UnknownScaleError as error:
@@ -265,7 +257,7 @@ def _choose(count: int) -> Sequence[int] | set[int]:
 
 
 @dataclass
-class _Seen:
+class _RecordingTally:
     """What was seen so far."""
 
     stamps_ns: list[int] = field(default_factory=list)

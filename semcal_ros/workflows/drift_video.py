@@ -39,8 +39,6 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.track_drift import DriftTrack
 
-__all__ = ["write_drift_video"]
-
 # Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a thousand
 # may be clipped at either end.
 _BLACK_WHITE = (0.001, 0.999)

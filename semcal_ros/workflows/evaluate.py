@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 from semcal_ros.core.calibration.judgement.evaluate import (
     compare_scales,
@@ -27,7 +28,7 @@ from semcal_ros.core.calibration.judgement.evaluate import (
 from semcal_ros.core.calibration.views import RejectedView, refuse_tilted_lines
 from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.workflows.conditions import ConditionsComparison
-from semcal_ros.workflows.find_grid import collect_views, find_views, named_frames
+from semcal_ros.workflows.find_grid import PATTERN_AGAIN, collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
     ConfigSource,
@@ -41,9 +42,8 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.options import CONFIG, DASK, MAGNIFICATION, PROGRESS, SQUARES, KeywordsOf
 from semcal_ros.workflows.workers import open_workers
-
-__all__ = ["Evaluation", "MagnificationError", "evaluate"]
 
 # 1-sigma of the heights on a stage if the calibration does not contain it.
 _HEIGHT_SIGMA_M = 1e-4
@@ -100,53 +100,49 @@ class Evaluation:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """What the grid of a recording is."""
+
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    magnification: Annotated[float | None, MAGNIFICATION] = None
+    squares_m: Annotated[Sequence[float] | None, SQUARES] = None
+    pattern: Annotated[str, PATTERN_AGAIN] = "auto"
+    dask: Annotated[str | None, DASK] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(EvaluateOptions)
 def evaluate(
-    calibration: CalibrationSource,
-    source: Source,
-    *,
-    config: ConfigSource | None = None,
-    magnification: float | None = None,
-    squares_m: Sequence[float] | None = None,
-    pattern: str = "auto",
-    dask: str | None = None,
-    on_progress: OnProgress = ignore_progress,
+    calibration: CalibrationSource, source: Source, options: EvaluateOptions
 ) -> Evaluation:
     """Fit a pose to each view of the grid, not the camera, and compare.
 
     The reprojection error does not show a wrong scale, because the heights of the views imitate
     it; so the scale is compared by itself, with heights that are as usual as in the calibration.
 
-    Parameters
-    ----------
-    calibration
-        A calibration or its file.
-    source
-        A recording that was not used for the calibration, or (image, magnification) tuples in memory.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    magnification
-        Magnification of a folder of ordinary images, which do not contain it.
-    squares_m
-        Sides of the squares of the grid, or pitches, in place of those of the configuration, m.
-    pattern
-        What the grid consists of, as in :func:`~semcal_ros.workflows.calibrate.calibrate`;
-        ``"auto"`` is a grating where the calibration was made with one.
-    dask
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers find the corners.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    ``calibration`` is one or its file; ``source`` a recording that was not used for it, or (image, magnification)
+    tuples in memory.
 
     Raises
     ------
     SemcalError
         If calibration, configuration or recording cannot be read, or no view can be used.
     """
+    return evaluate_recording(calibration, source, options)
+
+
+def evaluate_recording(
+    calibration: CalibrationSource, source: Source, options: EvaluateOptions
+) -> Evaluation:
+    """As :func:`evaluate`, for options that are an object already."""
+    squares_m, on_progress = options.squares_m, options.on_progress
     model = require_calibration(calibration)
-    microscope = resolve_config(config, model)
+    microscope = resolve_config(options.config, model)
     conditions = ConditionsComparison(model)
     with (
-        open_workers(dask) as workers,
-        open_source(source, microscope, magnification=magnification) as opened,
+        open_workers(options.dask) as workers,
+        open_source(source, microscope, magnification=options.magnification) as opened,
     ):
         advance = count_frames(on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(
@@ -154,7 +150,7 @@ def evaluate(
             on_progress=advance,
             workers=workers if workers.elsewhere else None,
             keep_images=False,
-            pattern=choose_pattern(pattern, model),
+            pattern=choose_pattern(options.pattern, model),
         )
         notes = (*opened.notes, *conditions.notes)
     collected = collect_views(

@@ -42,8 +42,6 @@ from semcal_ros.files.foreign_cameras import (
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
 from semcal_ros.workflows.describe_camera import parameter_sigma
 
-__all__ = ["EXPORT_FORMATS", "LOSSY_PX", "ExportedCamera", "export_calibration"]
-
 #: Formats, and the suffixes of their files.
 EXPORT_FORMATS = {
     "opencv": (".yaml", ".yml"),

@@ -43,15 +43,6 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.provenance import describe_provenance
 
-__all__ = [
-    "RecordingExtension",
-    "SeenLadder",
-    "extend",
-    "extend_by_pictures",
-    "make_picture",
-    "read_ladder",
-]
-
 # Digits of a magnification: the same setting is the same number, however a file rounds it.
 _DIGITS = 9
 

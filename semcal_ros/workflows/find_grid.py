@@ -39,6 +39,7 @@ from semcal_ros.core.calibration.views import (
 )
 from semcal_ros.core.corners import (
     PATTERN_NAMES,
+    PATTERNS,
     LatticeDetection,
     LatticeStatus,
     check_pattern,
@@ -47,17 +48,24 @@ from semcal_ros.core.corners import (
 from semcal_ros.core.errors import CalibrationError, Rejection
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame, Recording
+from semcal_ros.workflows.options import Option
 from semcal_ros.workflows.workers import Workers
 
-__all__ = [
-    "CollectedViews",
-    "NamedFrame",
-    "Progress",
-    "collect_views",
-    "count_visits",
-    "find_views",
-    "named_frames",
-]
+PATTERN = Option(
+    "What the grid consists of: chess squares, dots or holes, crosses, crossed lines, or a grating of parallel lines, "
+    "which is turned and not tilted.",
+    choices=PATTERNS,
+    python="Of all but chess boards, ``squares_m`` is the distance from one to the next.",
+)
+# Of a grid that a calibration is compared with.
+PATTERN_AGAIN = replace(
+    PATTERN, python='``"auto"`` is a grating where the calibration was made with one.'
+)
+UNTILTED = Option(
+    "Frames without tilt, by number or by file name, if no stage says the tilts.",
+    kind="untilted",
+    python='Or ``"none"``; ``"all"``; or ``"auto"``, which finds them where they can be told.',
+)
 
 #: Called with the number of frames that were done since the last call.
 Progress = Callable[[int], object]

@@ -37,14 +37,6 @@ from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.files.recordings import RecordedFrame
 
-__all__ = [
-    "GIVE_FRAME_TIME",
-    "DriftFollower",
-    "camera_for",
-    "estimate_timing",
-    "start_time_s",
-]
-
 #: What a user can do about a timing that is not configured.
 GIVE_FRAME_TIME = "give the time of one pass as --frame-time or in a configuration"
 

@@ -27,8 +27,6 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tables import read_table
 from semcal_ros.workflows.provenance import describe_computation
 
-__all__ = ["import_calibration"]
-
 _METRES = {"pm": 1e-12, "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "m": 1.0}
 # The pixel size in a header: "nm per px", "nm/pixel", "pixel size (nm)", "nm_per_px".
 _UNIT = re.compile(r"(?<![a-zµμ])(pm|nm|um|µm|μm|mm|m)(?![a-zµμ])")

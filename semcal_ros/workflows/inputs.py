@@ -33,21 +33,6 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, Recording, open_recording
 
-__all__ = [
-    "CalibrationSource",
-    "ConfigSource",
-    "OnProgress",
-    "Source",
-    "check_positives",
-    "choose_pattern",
-    "count_frames",
-    "ignore_progress",
-    "open_source",
-    "require_calibration",
-    "resolve_calibration",
-    "resolve_config",
-]
-
 #: A bag or image files, with :class:`.RecordedFiles` where they do not say everything themselves; or images in
 #: memory: (image, magnification) or (image, magnification, time in s of its stamp), in the order of time.
 Source = str | os.PathLike[str] | RecordedFiles | Iterable[tuple[Any, ...]]

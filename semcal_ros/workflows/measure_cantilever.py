@@ -20,12 +20,13 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever import (
+    SHAPES,
     Repeatability,
     Series,
     SeriesSettings,
@@ -54,8 +55,15 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
-
-__all__ = ["CANTILEVER_COLUMNS", "CantileverMeasurement", "CantileverSeries", "measure_cantilever"]
+from semcal_ros.workflows.options import (
+    CONFIG,
+    FRAME_TIME,
+    MAGNIFICATION,
+    PROGRESS,
+    Keyword,
+    KeywordsOf,
+    Option,
+)
 
 #: Columns of the table of ``semcal measure cantilever``.
 CANTILEVER_COLUMNS = (
@@ -159,52 +167,73 @@ class CantileverMeasurement:
         write_table(Path(path), CANTILEVER_COLUMNS, rows)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CantileverOptions:
+    """What is known of a cantilever, and how its frames belong together."""
+
+    calibration: Annotated[
+        CalibrationSource,
+        Option("Calibration.", kind="path", required=True, python="Or its file."),
+    ]
+    length_m: Annotated[
+        float,
+        Option(
+            "Length of the cantilever, such as 35um; a bare number is in m.",
+            kind="length",
+            required=True,
+        ),
+    ]
+    poses: Annotated[
+        int | None,
+        Option(
+            "Number of poses at each magnification, with equally many frames each; by default, each frame is a pose.",
+            between=(1, None),
+            metavar="N",
+        ),
+    ] = None
+    shape: Annotated[
+        str,
+        Option(
+            "Shape of the bent beam: terms of second and third order; a beam loaded at its end; second order.",
+            choices=tuple(SHAPES),
+        ),
+    ] = "free"
+    bases: Annotated[
+        Sequence[Pixel],
+        Option(
+            "Base of the cantilever in the first frame, if it is not found automatically; once, or once for each "
+            "magnification in the order of the recording.",
+            kind="pixel",
+            names=("--base",),
+            repeated=True,
+            python="(x, y), px.",
+        ),
+    ] = ()
+    tips: Annotated[
+        Sequence[Pixel],
+        Option(
+            "Free end of the cantilever, likewise.", kind="pixel", names=("--tip",), repeated=True
+        ),
+    ] = ()
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    frame_time_s: Annotated[float | None, FRAME_TIME] = None
+    magnification: Annotated[float | None, MAGNIFICATION] = None
+    on_progress: Annotated[
+        OnProgress,
+        Keyword(f"{PROGRESS.text} Each frame counts twice."),
+    ] = ignore_progress
+
+
+@KeywordsOf(CantileverOptions)
 def measure_cantilever(
-    source: Source | Sequence[str | os.PathLike[str] | RecordedFiles],
-    *,
-    calibration: CalibrationSource,
-    length_m: float,
-    poses: int | None = None,
-    shape: str = "free",
-    bases: Sequence[Pixel] = (),
-    tips: Sequence[Pixel] = (),
-    config: ConfigSource | None = None,
-    frame_time_s: float | None = None,
-    magnification: float | None = None,
-    on_progress: OnProgress = ignore_progress,
+    source: Source | Sequence[str | os.PathLike[str] | RecordedFiles], options: CantileverOptions
 ) -> CantileverMeasurement:
     """Measure the deflection of the free end of a cantilever in each frame.
 
     The first pose is the reference: there, nothing touches the cantilever. All magnifications may
     be in one recording or each in its own; their k-th poses are compared. Deflections are positive
-    to the right as seen from the base.
-
-    Parameters
-    ----------
-    source
-        A recording, several of them, or (image, magnification[, time_s]) tuples in memory.
-    calibration
-        A calibration or its file.
-    length_m
-        Length of the cantilever, from its maker.
-    poses
-        Number of poses at each magnification, which follow each other with equally many frames;
-        None makes each frame a pose.
-    shape
-        ``"free"``, ``"beam"`` or another of
-        :data:`~semcal_ros.applications.cantilever.bending.SHAPES`.
-    bases, tips
-        (x, y) pixels of both ends of the cantilever in the first frame, if they are not found
-        automatically: none, one for all magnifications, or one for each.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    frame_time_s
-        Seconds of one pass over a frame, in place of what the configuration says.
-    magnification
-        Magnification of a folder of ordinary images, which do not contain it.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames; each counts
-        twice.
+    to the right as seen from the base. ``source`` is a recording, several of them, or
+    (image, magnification[, time_s]) tuples in memory.
 
     Raises
     ------
@@ -221,11 +250,22 @@ def measure_cantilever(
         bending.repeatability.deflection_m          # (magnifications, poses)
         bending.save("bending.csv")
     """
-    model = require_calibration(calibration)
-    microscope = resolve_config(config, model, frame_time_s)
-    runs, notes = _read(_list_sources(source), model, microscope, magnification, on_progress)
+    return measure_recorded_cantilever(source, options)
+
+
+def measure_recorded_cantilever(
+    source: Source | Sequence[str | os.PathLike[str] | RecordedFiles], options: CantileverOptions
+) -> CantileverMeasurement:
+    """As :func:`measure_cantilever`, for options that are an object already."""
+    length_m, poses, shape = options.length_m, options.poses, options.shape
+    on_progress = options.on_progress
+    model = require_calibration(options.calibration)
+    microscope = resolve_config(options.config, model, options.frame_time_s)
+    runs, notes = _read(
+        _list_sources(source), model, microscope, options.magnification, on_progress
+    )
     _check_counts(runs)
-    ends = _pair_ends(bases, tips, len(runs))
+    ends = _pair_ends(options.bases, options.tips, len(runs))
     total = 2 * sum(len(run.images) for run in runs)
     advance = count_frames(on_progress, "bending", total)
     series = []

@@ -20,7 +20,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -44,8 +44,7 @@ from semcal_ros.workflows.inputs import (
     resolve_calibration,
     resolve_config,
 )
-
-__all__ = ["RELIEF_SUFFIXES", "Relief", "measure_relief"]
+from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, KeywordsOf, Option
 
 #: Suffixes of what a relief is written to: a height map, a cloud of points, tables of points.
 RELIEF_SUFFIXES = (*TIFF_SUFFIXES, ".ply", *TABLE_SUFFIXES)
@@ -136,42 +135,65 @@ class Relief:
         }
 
 
-def measure_relief(
-    source: Source,
-    *,
-    tilts_rad: Sequence[float] | None = None,
-    axis_rad: float | None = None,
-    tilt_sigma_rad: float | None = None,
-    calibration: CalibrationSource | None = None,
-    config: ConfigSource | None = None,
-    on_progress: OnProgress = ignore_progress,
-) -> Relief:
+@dataclass(frozen=True, kw_only=True)
+class ReliefOptions:
+    """How two or three pictures were tilted."""
+
+    tilts_rad: Annotated[
+        Sequence[float] | None,
+        Option(
+            "Tilts of two or three images, such as 0deg,6deg,12deg (bare numbers are degrees), instead of those of the "
+            "stage: measures heights.",
+            kind="tilts",
+        ),
+    ] = None
+    axis_rad: Annotated[
+        float | None,
+        Option(
+            "About where the tilt axis points in the image, such as 90deg; its sense tells hills from dents.",
+            kind="angle",
+            names=("--tilt-axis",),
+            python="None for that of the configuration.",
+        ),
+    ] = None
+    tilt_sigma_rad: Annotated[
+        float | None,
+        Option(
+            "1-sigma of each tilt, such as 0.1deg, instead of that of the configuration.",
+            kind="angle",
+        ),
+    ] = None
+    calibration: Annotated[
+        CalibrationSource | None, Keyword("Gives the pixel size and its 1-sigma.")
+    ] = None
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(ReliefOptions)
+def measure_relief(source: Source, options: ReliefOptions) -> Relief:
     """Measure the relief of a specimen in two or three tilted pictures.
 
-    Parameters
-    ----------
-    source
-        A recording of two or three images, or (image, magnification) tuples in memory.
-    tilts_rad
-        Tilt of each; None for those of the stage in the recording.
-    axis_rad
-        About where the tilt axis points in the image; None for that of the configuration.
-    tilt_sigma_rad
-        1-sigma of each tilt; None for that of the configuration.
-    calibration
-        Gives the pixel size and its 1-sigma.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    ``source`` is a recording of two or three images, or (image, magnification) tuples in memory.
 
     Raises
     ------
     SemcalError
         If the recording cannot be read, tilts are missing, or the pictures allow no height map.
     """
-    model = resolve_calibration(calibration)
-    microscope = resolve_config(config, model)
+    return measure_recorded_relief(source, options)
+
+
+def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
+    """As :func:`measure_relief`, for options that are an object already."""
+    tilts_rad, axis_rad, tilt_sigma_rad = (
+        options.tilts_rad,
+        options.axis_rad,
+        options.tilt_sigma_rad,
+    )
+    on_progress = options.on_progress
+    model = resolve_calibration(options.calibration)
+    microscope = resolve_config(options.config, model)
     stage = microscope.stage
     with open_source(source, microscope) as opened:
         if opened.frame_count not in (2, 3):

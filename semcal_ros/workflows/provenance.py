@@ -34,16 +34,6 @@ from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.inputs import Source
 
-__all__ = [
-    "describe_computation",
-    "describe_provenance",
-    "describe_views",
-    "format_date",
-    "list_recording_files",
-    "sum_up",
-    "sum_up_conditions",
-]
-
 # Stamps before 2001 count from the start of a recording, not from 1970.
 _FIRST_DATE_NS = 978_307_200_000_000_000
 # Endings of a bag's data files, before that of a compressed one.

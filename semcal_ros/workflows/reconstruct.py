@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -51,9 +51,8 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.options import CONFIG, DASK, FRAME_TIME, PROGRESS, KeywordsOf, Option
 from semcal_ros.workflows.workers import open_workers
-
-__all__ = ["Reconstruction", "describe_departure", "reconstruct"]
 
 # A surface that is seen from outside bulges towards the gun nearly everywhere; its mirror image
 # nearly nowhere. Below this share the choice between the two is worth a warning.
@@ -151,41 +150,48 @@ class Reconstruction:
         }
 
 
-def reconstruct(
-    source: Source,
-    *,
-    calibration: CalibrationSource,
-    config: ConfigSource | None = None,
-    frame_time_s: float | None = None,
-    spacing_px: float = 5.0,
-    keyframes: int = 150,
-    height_sigma_m: float = 10e-6,
-    dask: str | None = None,
-    on_progress: OnProgress = ignore_progress,
-) -> Reconstruction:
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions:
+    """How a ball that turns is followed and measured."""
+
+    calibration: Annotated[
+        CalibrationSource,
+        Option(
+            "Needed for a ball; for tilted images it gives the pixel size and its 1-sigma.",
+            kind="path",
+            python="A calibration or its file.",
+        ),
+    ]
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    frame_time_s: Annotated[float | None, FRAME_TIME] = None
+    spacing_px: Annotated[
+        float, Option("Least distance of features in px.", between=(3.0, 100.0))
+    ] = 5.0
+    keyframes: Annotated[
+        int,
+        Option(
+            "Largest number of keyframes used.",
+            between=(3, 2000),
+            python="They are spread evenly.",
+        ),
+    ] = 150
+    height_sigma_m: Annotated[
+        float,
+        Option(
+            "1-sigma of the height above or below the plane of the calibration.",
+            kind="length or 0",
+            python="In m.",
+        ),
+    ] = 10e-6
+    dask: Annotated[str | None, DASK] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(ReconstructOptions)
+def reconstruct(source: Source, options: ReconstructOptions) -> Reconstruction:
     """Reconstruct a ball that turns: follow features, adjust points and poses, fit and mesh.
 
-    Parameters
-    ----------
-    source
-        A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
-    calibration
-        A calibration or its file.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    frame_time_s
-        Seconds of one pass over a frame, in place of what the configuration says.
-    spacing_px
-        Least distance of features, px.
-    keyframes
-        Largest number of keyframes used; they are spread evenly.
-    height_sigma_m
-        1-sigma of the height above or below the plane of the calibration, m.
-    dask
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers compare the patches.
-        Features are followed here.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    ``source`` is a bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
 
     Raises
     ------
@@ -202,13 +208,20 @@ def reconstruct(
         found.ball.diameter_m, found.ball.interval_m
         found.save_mesh("ball.ply")
     """
-    model = require_calibration(calibration)
-    microscope = resolve_config(config, model, frame_time_s)
-    tracker = SequenceTracker(TrackerSettings(spacing_px=spacing_px), keep_images=False)
+    return reconstruct_ball(source, options)
+
+
+def reconstruct_ball(source: Source, options: ReconstructOptions) -> Reconstruction:
+    """As :func:`reconstruct`, for options that are an object already."""
+    keyframes, height_sigma_m = options.keyframes, options.height_sigma_m
+    on_progress = options.on_progress
+    model = require_calibration(options.calibration)
+    microscope = resolve_config(options.config, model, options.frame_time_s)
+    tracker = SequenceTracker(TrackerSettings(spacing_px=options.spacing_px), keep_images=False)
     check_positive(keyframes, "keyframes =")
     if height_sigma_m != 0.0:
         check_positive(height_sigma_m, "height_sigma_m =")
-    with open_workers(dask) as workers:
+    with open_workers(options.dask) as workers:
         with open_source(source, microscope) as opened:
             outside = _track(opened, model, tracker, on_progress)
             notes = list(opened.notes)

@@ -20,9 +20,9 @@ import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from semcal_ros.bridge.names import absolute_namespace
 from semcal_ros.calibration import Calibration
@@ -65,9 +65,17 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.options import (
+    CONFIG,
+    DASK,
+    FRAME_TIME,
+    INTERPOLATION,
+    OVERWRITE,
+    PROGRESS,
+    KeywordsOf,
+    Option,
+)
 from semcal_ros.workflows.workers import open_workers
-
-__all__ = ["RectifiedFrame", "RectifiedRecording", "rectify"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,55 +136,53 @@ class RectifiedRecording:
         return tuple(frame.image for frame in self.frames)
 
 
-def rectify(
-    source: Source,
-    output: str | os.PathLike[str] | None = None,
-    *,
-    calibration: CalibrationSource,
-    config: ConfigSource | None = None,
-    frame_time_s: float | None = None,
-    drift: bool = True,
-    interpolation: str = "linear",
-    namespace: str = "/sem",
-    overwrite: bool = False,
-    scale_bar: bool = False,
-    dask: str | None = None,
-    on_progress: OnProgress = ignore_progress,
-) -> RectifiedRecording:
+@dataclass(frozen=True)
+class RectifyOptions:
+    """How frames are rectified, and what is written."""
+
+    output: Annotated[
+        str | os.PathLike[str] | None,
+        Option(
+            "A TIFF of all frames, a folder of TIFFs (its name ends with /), a PNG of one frame, or a bag.",
+            names=("-o", "--output"),
+            metavar="FILE.tif|FOLDER/|FILE.png|BAG",
+            required=True,
+            python="All frames of a TIFF have one magnification; a bag has camera_info and projection_stamped of each "
+            "frame. TIFFs hold pixel size, times and conditions, in the depth of the recording. Without it, the frames "
+            "are returned, which takes the memory of all of them.",
+        ),
+    ] = None
+    _: KW_ONLY
+    calibration: Annotated[
+        CalibrationSource,
+        Option("Calibration.", kind="path", required=True, python="Or its file."),
+    ]
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    frame_time_s: Annotated[float | None, FRAME_TIME] = None
+    scale_bar: Annotated[
+        bool, Option("Append a strip with a scale bar and its uncertainty below each picture.")
+    ] = False
+    drift: Annotated[
+        bool,
+        Option(
+            "Leave drift in; correct distortion only.",
+            names=("--no-drift",),
+            python="That is what False does.",
+        ),
+    ] = True
+    interpolation: Annotated[str, INTERPOLATION] = "linear"
+    namespace: Annotated[str, Option("Namespace of the topics in the output.")] = "/sem"
+    overwrite: Annotated[bool, OVERWRITE] = False
+    dask: Annotated[str | None, DASK] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(RectifyOptions)
+def rectify(source: Source, options: RectifyOptions) -> RectifiedRecording:
     """Undo distortion and drift of each frame in one interpolation.
 
-    Each frame is corrected with what is known when it arrives, as in the nodes.
-
-    Parameters
-    ----------
-    source
-        A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
-    output
-        What to make, by its name: ``x.tif``, one TIFF of all frames, which must have one magnification;
-        ``x/``, a folder of TIFFs; ``x.png`` of a single frame; else a bag, with camera_info and
-        projection_stamped of each frame. TIFFs hold pixel size, times and conditions, in the depth of the
-        recording. Without it, the frames are returned, which takes the memory of all of them.
-    calibration
-        A calibration or its file.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    frame_time_s
-        Seconds of one pass over a frame, in place of what the configuration says.
-    drift
-        False leaves drift in.
-    interpolation
-        ``"linear"``, ``"cubic"`` or ``"lanczos4"``.
-    namespace
-        Of the topics in the bag.
-    overwrite
-        Whether to replace an existing bag or folder, once the new one is complete.
-    scale_bar
-        Whether to append a strip with a scale bar and its 1-sigma below each picture.
-    dask
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers resample the frames.
-        The drift is measured here.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    Each frame is corrected with what is known when it arrives, as in the nodes. ``source`` is a bag, a folder of SEM
+    TIFF files, or (image, magnification[, time_s]) tuples in memory.
 
     Raises
     ------
@@ -193,12 +199,19 @@ def rectify(
         rectify("recordings/zoom", "zoom_rect", calibration="jsm820.yaml")
         flat = rectify("recordings/zoom", calibration="jsm820.yaml").images
     """
-    model = require_calibration(calibration)
-    microscope = resolve_config(config, model, frame_time_s)
+    return rectify_recording(source, options)
+
+
+def rectify_recording(source: Source, options: RectifyOptions) -> RectifiedRecording:
+    """As :func:`rectify`, for options that are an object already."""
+    output, scale_bar, overwrite = options.output, options.scale_bar, options.overwrite
+    on_progress = options.on_progress
+    model = require_calibration(options.calibration)
+    microscope = resolve_config(options.config, model, options.frame_time_s)
     hindsight, follow = microscope.scan is None, microscope.follow
-    follower = DriftFollower(hindsight=hindsight, follow=follow) if drift else None
-    rectifier = Rectifier(interpolation)
-    topics = absolute_namespace(namespace)
+    follower = DriftFollower(hindsight=hindsight, follow=follow) if options.drift else None
+    rectifier = Rectifier(options.interpolation)
+    topics = absolute_namespace(options.namespace)
     kind = None if output is None else _choose_kind(output, scale_bar)
     target = None if output is None else Path(output)
     frames: list[RectifiedFrame] = []
@@ -206,7 +219,7 @@ def rectify(
     states: Counter[str] = Counter()
     extrapolated, count, matched = 0, 0, 0
     with ExitStack() as open_files:
-        workers = open_files.enter_context(open_workers(dask))
+        workers = open_files.enter_context(open_workers(options.dask))
         opened = open_files.enter_context(open_source(source, microscope))
         write: _Write | None = None
         if kind is not None and target is not None:

@@ -37,8 +37,6 @@ from semcal_ros.workflows.follow_drift import (
 )
 from semcal_ros.workflows.inputs import OnProgress, count_frames, ignore_progress
 
-__all__ = ["FrameSelection", "select_frames"]
-
 # Magnifications that an error lists: as many as fit two lines of a terminal.
 _LISTED = 12
 # Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a

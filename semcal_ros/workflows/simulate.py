@@ -17,9 +17,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.errors import InvalidValueError
@@ -27,6 +28,9 @@ from semcal_ros.core.wording import did_you_mean
 from semcal_ros.files.bags.simulated import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
+    DRIFTS,
+    PRESETS,
+    SPECIMEN_KINDS,
     STAGES,
     TYPICAL_GRID,
     Detector,
@@ -39,6 +43,7 @@ from semcal_ros.synthetic import (
     drift_plan,
     drift_preset,
     ladder_plan,
+    make_stage,
     preset,
     steps_plan,
     truth_of,
@@ -50,8 +55,7 @@ from semcal_ros.workflows.inputs import (
     count_frames,
     ignore_progress,
 )
-
-__all__ = ["MOST_FRAMES", "MOST_VIEWS", "PLAN_KINDS", "plan_recording", "simulate"]
+from semcal_ros.workflows.options import OVERWRITE, PROGRESS, Keyword, KeywordsOf, Option
 
 #: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen beyond the
 #: grid.
@@ -64,49 +68,144 @@ _MAGNIFICATIONS = {"drift": 1, "zoom": 2, "ladder": 2}
 _STAGE = STAGES["one-axis"]
 
 
+@dataclass(frozen=True)
+class SimulationOptions:
+    """What is recorded, by which virtual microscope, and how."""
+
+    plan: Annotated[
+        str,
+        Option(
+            "Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen "
+            "beyond the grid.",
+            choices=PLAN_KINDS,
+        ),
+    ] = "grid"
+    microscope: Annotated[
+        str, Option("Virtual microscope.", names=("--preset",), choices=sorted(PRESETS))
+    ] = "jsm820"
+    specimen: Annotated[
+        str | None, Option("Specimen of all plans but grid.", choices=SPECIMEN_KINDS)
+    ] = None
+    drift: Annotated[str | None, Option("Drift of the specimen.", choices=sorted(DRIFTS))] = None
+    magnifications: Annotated[
+        tuple[float, ...],
+        Option(
+            "grid, steps: repeat for each; drift: one; zoom, ladder: first and last.",
+            names=("--magnification",),
+            repeated=True,
+            python="The default is that of the plan.",
+        ),
+    ] = ()
+    views: Annotated[int, Option("grid, ladder: poses each.", between=(1, MOST_VIEWS))] = 5
+    frames: Annotated[
+        int | None,
+        Option("drift, zoom: number of frames; steps: of each step.", between=(1, MOST_FRAMES)),
+    ] = None
+    size: Annotated[int, Option("Width and height.", between=(32, 8192), python="In px.")] = 512
+    bits: Annotated[int, Option("Depth of the grey levels.", choices=(8, 16))] = 8
+    electrons: Annotated[
+        float | None, Option("Electrons per pixel; 0 for no shot noise.", between=(0, None))
+    ] = None
+    blur_px: Annotated[float | None, Option("Sigma of the beam in px.", between=(0, None))] = None
+    seed: Annotated[int, Option("Seed of poses, specimen and noise.")] = 0
+    stage: Annotated[SimulatedStage | None, Keyword("Faults of the stage; None: perfect.")] = _STAGE
+    grid: Annotated[GridFaults | None, Keyword("Faults of the grid; None: perfect.")] = TYPICAL_GRID
+    overwrite: Annotated[bool, OVERWRITE] = False
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@dataclass(frozen=True)
+class FaultOptions:
+    """Faults of stage, scan and grid, as a user states them."""
+
+    stage: Annotated[
+        str,
+        Option(
+            "One tilt axis, which says its tilt; or tilts in every direction, as no stage does.",
+            choices=tuple(STAGES),
+        ),
+    ] = "one-axis"
+    eucentric_error_m: Annotated[
+        float | None,
+        Option(
+            "How far the axis of a one-axis stage misses the specimen.  "
+            f"[default: {1e6 * _STAGE.miss_m[0]:g}um]",
+            kind="length or 0",
+        ),
+    ] = None
+    repeatability: Annotated[
+        float,
+        Option("1-sigma of the scale, each time that a magnification is set.", kind="ratio"),
+    ] = _STAGE.scale_sigma
+    grid_stretch: Annotated[float, Option("Difference of the grid's axes.", kind="ratio")] = (
+        TYPICAL_GRID.stretch
+    )
+    grid_shear: Annotated[
+        float, Option("How far the grid's axes are from a right angle.", kind="ratio")
+    ] = TYPICAL_GRID.shear
+    grid_bow_m: Annotated[
+        float,
+        Option(
+            "Radius to which the grid is bowed; 0 for a flat one.",
+            kind="length or 0",
+            metavar="RADIUS",
+        ),
+    ] = 1.0 / TYPICAL_GRID.curvature
+    grid_wave: Annotated[
+        float, Option("Amplitude of a wave in its rows, of a square.", kind="ratio")
+    ] = TYPICAL_GRID.wave
+    grid_squares: Annotated[float, Option("1-sigma of each size of its squares.", kind="ratio")] = (
+        TYPICAL_GRID.squares_sigma
+    )
+    line_jitter_px: Annotated[
+        float, Option("1-sigma of the shift of each scan line in px.", between=(0, None))
+    ] = _STAGE.line_jitter_px
+
+    def make_stage(self) -> SimulatedStage:
+        """Return the stage; raises :class:`InvalidValueError`."""
+        return make_stage(
+            self.stage,
+            eucentric_error_m=self.eucentric_error_m,
+            repeatability=self.repeatability,
+            line_jitter_px=self.line_jitter_px,
+        )
+
+    def make_grid(self) -> GridFaults:
+        """Return the grid; raises :class:`InvalidValueError`."""
+        return replace(
+            TYPICAL_GRID,
+            stretch=self.grid_stretch,
+            shear=self.grid_shear,
+            curvature=1.0 / self.grid_bow_m if self.grid_bow_m > 0.0 else 0.0,
+            wave=self.grid_wave,
+            squares_sigma=self.grid_squares,
+        )
+
+
 def plan_recording(
-    kind: str,
     microscope: VirtualMicroscope,
+    options: SimulationOptions | None = None,
     detector: Detector | None = None,
-    *,
-    specimen: str | None = None,
-    drift: str | None = None,
-    magnifications: Sequence[float] = (),
-    views: int = 5,
-    frames: int | None = None,
-    seed: int = 0,
-    stage: SimulatedStage | None = _STAGE,
-    grid: GridFaults | None = TYPICAL_GRID,
 ) -> RecordingPlan:
     """Plan a recording.
 
     Parameters
     ----------
-    kind
-        One of :data:`PLAN_KINDS`.
     microscope, detector
-        What records.
-    specimen
-        What is seen, if it is not the grid of the plan ``grid``.
-    drift
-        Name of the drift of the specimen.
-    magnifications
-        For ``drift`` one, for ``zoom`` and ``ladder`` the first and the last, else any number; the default is
-        that of the plan.
-    views
-        Number of poses at each magnification (``grid``, ``ladder``).
-    frames
-        Number of frames, for ``steps`` at each magnification.
-    seed
-        Seed of poses, specimen and noise.
-    stage, grid
-        Faults of the stage and of the grid, or None for perfect ones.
+        What records, in place of those of the options.
+    options
+        What is recorded.
 
     Raises
     ------
     InvalidValueError
-        For an unknown kind or name, the wrong number of magnifications, or more views or frames than anyone needs.
+        For an unknown plan or name, the wrong number of magnifications, or more views or frames than anyone needs.
     """
+    chosen_options = options or SimulationOptions()
+    kind, specimen, drift = chosen_options.plan, chosen_options.specimen, chosen_options.drift
+    magnifications, views = chosen_options.magnifications, chosen_options.views
+    frames, seed = chosen_options.frames, chosen_options.seed
+    stage, grid = chosen_options.stage, chosen_options.grid
     if kind not in PLAN_KINDS:
         raise InvalidValueError(
             f"plan {kind!r}",
@@ -184,45 +283,9 @@ def plan_recording(
     return plan if drift is None else replace(plan, drift=drift_preset(drift))
 
 
-def simulate(
-    output: str | os.PathLike[str],
-    plan: str = "grid",
-    *,
-    microscope: str = "jsm820",
-    specimen: str | None = None,
-    drift: str | None = None,
-    magnifications: Sequence[float] = (),
-    views: int = 5,
-    frames: int | None = None,
-    size: int = 512,
-    bits: int = 8,
-    electrons: float | None = None,
-    blur_px: float | None = None,
-    seed: int = 0,
-    stage: SimulatedStage | None = _STAGE,
-    grid: GridFaults | None = TYPICAL_GRID,
-    overwrite: bool = False,
-    on_progress: OnProgress = ignore_progress,
-) -> int:
+@KeywordsOf(SimulationOptions)
+def simulate(output: str | os.PathLike[str], options: SimulationOptions) -> int:
     """Record the virtual SEM to a bag, with ``truth.json`` (SI units) beside it.
-
-    Parameters
-    ----------
-    output
-        Bag to make.
-    plan, specimen, drift, magnifications, views, frames, seed, stage, grid
-        As for :func:`plan_recording`.
-    microscope
-        Name of the virtual microscope.
-    size
-        Width and height of the images, px.
-    bits, electrons, blur_px
-        Depth of the grey levels, electrons per pixel (0 for no shot noise), and sigma of the beam;
-        None for those of the detector.
-    overwrite
-        Whether to replace an existing bag, once the new one is complete.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
 
     Returns
     -------
@@ -233,35 +296,28 @@ def simulate(
     SemcalError
         For an unknown name or a value out of range, or if the bag exists or cannot be written.
     """
-    scope = preset(microscope)
-    if size != scope.width:
-        scope = scope.with_image_size(size, size)
-    detector = Detector(bits=bits)
-    if electrons is not None:
-        detector = replace(detector, electrons=electrons)
-    if blur_px is not None:
-        detector = replace(detector, blur_px=blur_px)
-    recording = plan_recording(
-        plan,
-        scope,
-        detector,
-        specimen=specimen,
-        drift=drift,
-        magnifications=magnifications,
-        views=views,
-        frames=frames,
-        seed=seed,
-        stage=stage,
-        grid=grid,
-    )
-    advance = count_frames(on_progress, "simulating", len(recording))
+    return record_simulation(output, options)
+
+
+def record_simulation(output: str | os.PathLike[str], options: SimulationOptions) -> int:
+    """As :func:`simulate`, for options that are an object already."""
+    scope = preset(options.microscope)
+    if options.size != scope.width:
+        scope = scope.with_image_size(options.size, options.size)
+    detector = Detector(bits=options.bits)
+    if options.electrons is not None:
+        detector = replace(detector, electrons=options.electrons)
+    if options.blur_px is not None:
+        detector = replace(detector, blur_px=options.blur_px)
+    recording = plan_recording(scope, options, detector)
+    advance = count_frames(options.on_progress, "simulating", len(recording))
     write_simulated(
         Path(output),
         recording.frames,
         _render(recording, advance),
         truth_of(recording),
         conditions=conditions_of(scope),
-        overwrite=overwrite,
+        overwrite=options.overwrite,
     )
     return len(recording)
 

@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.images.scale_bar import choose_scale_bar
 from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES, pixel_scale, write_image
 from semcal_ros.files.recordings import RecordedFrame, Recording
-from semcal_ros.files.video import check_video, open_video, shade
+from semcal_ros.files.video import FPS_RANGE, check_video, open_video, shade
 from semcal_ros.workflows.follow_drift import camera_for
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -60,10 +60,18 @@ from semcal_ros.workflows.inputs import (
     resolve_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.options import (
+    CONFIG,
+    DASK,
+    FRAME_TIME,
+    INTERPOLATION,
+    MAGNIFICATION,
+    PROGRESS,
+    KeywordsOf,
+    Option,
+)
 from semcal_ros.workflows.select_frames import FrameSelection, select_frames
 from semcal_ros.workflows.workers import open_workers
-
-__all__ = ["StackResult", "stack"]
 
 # Frames that are added up by themselves before their sums are added to the others'. Of 8-bit
 # frames, so many have the size of their sums, which come back from a cluster.
@@ -173,65 +181,108 @@ class StackResult:
         write_image(path, image, scale, stamp_ns=self.stamps_ns[0], databar=scale_bar, notes=notes)
 
 
-def stack(
-    source: Source,
-    *,
-    calibration: CalibrationSource | None = None,
-    config: ConfigSource | None = None,
-    frame_time_s: float | None = None,
-    magnification: float | None = None,
-    at: float | None = None,
-    drift: bool = True,
-    scan_pairs_deg: float | None = None,
-    interpolation: str = "cubic",
-    video: str | os.PathLike[str] | None = None,
-    fps: float = 10.0,
-    output: str | os.PathLike[str] | None = None,
-    sigma: str | os.PathLike[str] | None = None,
-    scale_bar: bool = False,
-    dask: str | None = None,
-    on_progress: OnProgress = ignore_progress,
-) -> StackResult:
+@dataclass(frozen=True, kw_only=True)
+class StackOptions:
+    """Which frames are averaged, how, and what is written."""
+
+    calibration: Annotated[
+        CalibrationSource | None,
+        Option("Undo distortion, too.", kind="path", python="A calibration or its file."),
+    ] = None
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    frame_time_s: Annotated[float | None, FRAME_TIME] = None
+    magnification: Annotated[float | None, MAGNIFICATION] = None
+    output: Annotated[
+        str | os.PathLike[str] | None,
+        Option(
+            "Average: .tif (32-bit, with the pixel size) or .png (as deep as the recording).",
+            kind="path",
+            names=("-o", "--output"),
+            required=True,
+            python="As :meth:`StackResult.save` writes it.",
+        ),
+    ] = None
+    sigma: Annotated[
+        str | os.PathLike[str] | None,
+        Option("Standard error of the average: .tif.", kind="path"),
+    ] = None
+    video: Annotated[
+        str | os.PathLike[str] | None, Option("Stabilised video: .mp4 or .avi.", kind="path")
+    ] = None
+    fps: Annotated[float, Option("Frames per second of the video.", between=FPS_RANGE)] = 10.0
+    at: Annotated[
+        float | None,
+        Option(
+            "Take the frames of this magnification.",
+            metavar="G",
+            python="None where there is only one.",
+        ),
+    ] = None
+    scale_bar: Annotated[
+        bool,
+        Option(
+            "Append a strip with a scale bar and its uncertainty below the average.",
+            python="The video has one in any case.",
+        ),
+    ] = False
+    drift: Annotated[
+        bool,
+        Option(
+            "Average the frames where they are.",
+            names=("--no-drift",),
+            python="That is what False does.",
+        ),
+    ] = True
+    scan_pairs_deg: Annotated[
+        float | None,
+        Option(
+            "Of 2 to 12 frames, every second one was scanned with a scan rotation of 90 or -90 degrees (90: it shows "
+            "the specimen turned clockwise): undo the drift within the scans, and average the square that all show.",
+            kind="quarter turn",
+            python="See :mod:`~semcal_ros.core.drift.scan_pairs`. Neither stamps nor a frame time are used; no video, "
+            "no Dask, no other interpolation.",
+        ),
+    ] = None
+    interpolation: Annotated[str, INTERPOLATION] = "cubic"
+    dask: Annotated[str | None, DASK] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+    @property
+    def quarter_turns(self) -> int | None:
+        """By how many quarters of a turn every second scan was turned; None where none was.
+
+        Raises
+        ------
+        InvalidValueError
+            It is no quarter of a turn, or another option does not go with it.
+        """
+        if self.scan_pairs_deg is None:
+            return None
+        others = {
+            "--no-drift": not self.drift,
+            "--video": self.video is not None,
+            "--dask": self.dask is not None,
+            "--interpolation": self.interpolation != "cubic",
+        }
+        if abs(abs(self.scan_pairs_deg) - 90.0) > 1e-9:
+            raise InvalidValueError(
+                f"--scan-pairs {self.scan_pairs_deg:g}",
+                expected="90 or -90, the scan rotation of every second frame in degrees",
+            )
+        for name, given in others.items():
+            if given:
+                raise InvalidValueError(
+                    f"--scan-pairs together with {name}", expected="one of the two"
+                )
+        return round(self.scan_pairs_deg / 90.0)
+
+
+@KeywordsOf(StackOptions)
+def stack(source: Source, options: StackOptions) -> StackResult:
     """Average frames, each shifted to the specimen's position in the first frame.
 
-    Frames whose drift is not known are left out.
-
-    Parameters
-    ----------
-    source
-        A bag, a folder of images, or (image, magnification[, time_s]) tuples in memory.
-    calibration
-        A calibration or its file, to undo distortion too.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    frame_time_s
-        Seconds of one pass over a frame, in place of what the configuration says.
-    magnification
-        Magnification of a folder of ordinary images, which do not contain it.
-    at
-        The magnification whose frames are taken; None where there is only one.
-    drift
-        False averages the frames without shifting them.
-    scan_pairs_deg
-        90 or -90: every second frame was scanned with the raster turned by this scan rotation, where a positive one
-        turns the specimen in the image from +x towards +y. The drift within the scans is then measured
-        (:mod:`~semcal_ros.core.drift.scan_pairs`), and the average shows the square that all of them do, as with no
-        scan rotation. Neither stamps nor a frame time are used; at most 12 frames, no
-        video, no Dask, no other interpolation.
-    interpolation
-        ``"linear"``, ``"cubic"`` or ``"lanczos4"``.
-    video, fps
-        File of a stabilised video (``.mp4`` or ``.avi``), and its frames per second.
-    output, sigma
-        Files of the average and of its standard error, as :meth:`StackResult.save` and
-        :meth:`StackResult.save_sigma` write them.
-    scale_bar
-        Whether the average gets a strip with a scale bar; the video has one in any case.
-    dask
-        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers resample and add up
-        the frames. The drift is measured here.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    Frames whose drift is not known are left out. ``source`` is a bag, a folder of images, or
+    (image, magnification[, time_s]) tuples in memory.
 
     Raises
     ------
@@ -250,38 +301,33 @@ def stack(
         average.image.mean, average.image.standard_error      # (h, w) each
         average.save("gold.tif")
     """
-    model = resolve_calibration(calibration)
-    microscope = resolve_config(config, model, frame_time_s)
-    film_path = None if video is None else Path(video)
+    return stack_recording(source, options)
+
+
+def stack_recording(source: Source, options: StackOptions) -> StackResult:
+    """As :func:`stack`, for options that are an object already."""
+    model = resolve_calibration(options.calibration)
+    microscope = resolve_config(options.config, model, options.frame_time_s)
+    film_path = None if options.video is None else Path(options.video)
     if film_path is not None:
-        check_video(film_path, fps)
-    if at is not None:
-        at = check_positive(at, "at =")
-    _check_suffix(output, IMAGE_SUFFIXES)
-    _check_suffix(sigma, TIFF_SUFFIXES)
-    quarter = None
-    if scan_pairs_deg is not None:
-        others = {
-            "--no-drift": not drift,
-            "--video": film_path is not None,
-            "--dask": dask is not None,
-            "--interpolation": interpolation != "cubic",
-        }
-        quarter = _check_scan_pairs(
-            scan_pairs_deg, [name for name, given in others.items() if given]
-        )
+        check_video(film_path, options.fps)
+    at = None if options.at is None else check_positive(options.at, "at =")
+    _check_suffix(options.output, IMAGE_SUFFIXES)
+    _check_suffix(options.sigma, TIFF_SUFFIXES)
+    quarter = options.quarter_turns
+    on_progress = options.on_progress
     with (
-        open_workers(dask) as workers,
-        open_source(source, microscope, magnification=magnification) as opened,
+        open_workers(options.dask) as workers,
+        open_source(source, microscope, magnification=options.magnification) as opened,
     ):
         selection = select_frames(
             opened,
             microscope,
             model,
             at=at,
-            drift=drift and quarter is None,
+            drift=options.drift and quarter is None,
             levels=film_path is not None,
-            on_first=lambda frame: _check_output(output, frame),
+            on_first=lambda frame: _check_output(options.output, frame),
             on_progress=on_progress,
         )
         used = _choose_usable(selection)
@@ -302,11 +348,11 @@ def stack(
                 opened.notes,
                 scan_drift,
             )
-            return _save(result, output, sigma, scale_bar)
-        summed = Stack(selection.size, interpolation)
+            return _save(result, options)
+        summed = Stack(selection.size, options.interpolation)
         grey = _choose_video_levels(selection)
         count = len(selection.indices)
-        with open_video(film_path, selection.size, count, fps) as film:
+        with open_video(film_path, selection.size, count, options.fps) as film:
             advance = count_frames(on_progress, "averaging", int(used.sum()))
             frames = _read_chosen(opened, model, selection, used, film is not None)
             levels = None if film is None else grey
@@ -315,7 +361,7 @@ def stack(
             # In this process, a part is read frame by frame while it is added up.
             orders = (
                 (list(part) if workers.elsewhere else part, selection.config.scan)
-                + (selection.size, interpolation, levels)
+                + (selection.size, options.interpolation, levels)
                 for _, part in groupby(frames, lambda frame: frame.number // _FRAMES_PER_PART)
             )
             for sums, images in workers.starmap(add_part, orders):
@@ -341,34 +387,15 @@ def stack(
         selection.config,
         notes,
     )
-    return _save(result, output, sigma, scale_bar)
+    return _save(result, options)
 
 
-def _save(
-    result: StackResult,
-    output: str | os.PathLike[str] | None,
-    sigma: str | os.PathLike[str] | None,
-    scale_bar: bool,
-) -> StackResult:
-    if sigma is not None:
-        result.save_sigma(sigma)
-    if output is not None:
-        result.save(output, scale_bar=scale_bar)
+def _save(result: StackResult, options: StackOptions) -> StackResult:
+    if options.sigma is not None:
+        result.save_sigma(options.sigma)
+    if options.output is not None:
+        result.save(options.output, scale_bar=options.scale_bar)
     return result
-
-
-def _check_scan_pairs(scan_pairs_deg: float, others: Sequence[str]) -> int:
-    """Return the scan rotation in quarters of a turn; ``others`` are options that do not go with it."""
-    if abs(abs(scan_pairs_deg) - 90.0) > 1e-9:
-        raise InvalidValueError(
-            f"--scan-pairs {scan_pairs_deg:g}",
-            expected="90 or -90, the scan rotation of every second frame in degrees",
-        )
-    if others:
-        raise InvalidValueError(
-            f"--scan-pairs together with {others[0]}", expected="one of the two"
-        )
-    return round(scan_pairs_deg / 90.0)
 
 
 def _average_pairs(
@@ -434,7 +461,7 @@ def _choose_usable(selection: FrameSelection) -> Mask:
     return usable
 
 
-class _Frame(NamedTuple):
+class _ChosenFrame(NamedTuple):
     """A chosen frame: its number among them, and what it needs to be added."""
 
     number: int
@@ -452,7 +479,7 @@ def _read_chosen(
     used: Mask,
     unused_too: bool,
     masks: bool = False,
-) -> Iterator[_Frame]:
+) -> Iterator[_ChosenFrame]:
     """Read the chosen frames, of which a video shows those, too, that are not used; with masks where they are wanted,
     which a frame would else carry to the workers for nothing.
     """
@@ -464,11 +491,13 @@ def _read_chosen(
         drift = None if selection.path is None else selection.path[number].raster
         grey = to_gray(frame.image, frame.encoding)
         camera = camera_for(frame, model, selection.config)
-        yield _Frame(number, grey, camera, drift, bool(used[number]), frame.mask if masks else None)
+        yield _ChosenFrame(
+            number, grey, camera, drift, bool(used[number]), frame.mask if masks else None
+        )
 
 
 def add_part(
-    frames: Iterable[_Frame],
+    frames: Iterable[_ChosenFrame],
     scan: ScanTiming | None,
     size: tuple[int, int],
     interpolation: str,

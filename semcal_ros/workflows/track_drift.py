@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -48,8 +49,7 @@ from semcal_ros.workflows.inputs import (
     resolve_calibration,
     resolve_config,
 )
-
-__all__ = ["DriftTrack", "describe_forecast", "describe_rate", "track_drift"]
+from semcal_ros.workflows.options import CONFIG, FRAME_TIME, PROGRESS, KeywordsOf, Option
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,34 +137,33 @@ def _describe_similarity(path: DriftPath) -> str:
     return f"the image turned by {turn} and grew by {scale} from the first frame to the last"
 
 
-def track_drift(
-    source: Source,
-    *,
-    calibration: CalibrationSource | None = None,
-    config: ConfigSource | None = None,
-    frame_time_s: float | None = None,
-    live: bool = False,
-    on_progress: OnProgress = ignore_progress,
-) -> DriftTrack:
+@dataclass(frozen=True, kw_only=True)
+class DriftOptions:
+    """How the drift of a recording is measured."""
+
+    calibration: Annotated[
+        CalibrationSource | None,
+        Option(
+            "Work in rectified coordinates.",
+            kind="path",
+            python="A calibration or its file; without it, drift is in raw pixels of the nominal size.",
+        ),
+    ] = None
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    frame_time_s: Annotated[float | None, FRAME_TIME] = None
+    live: Annotated[bool, Option("Drift as known live, without hindsight from later frames.")] = (
+        False
+    )
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(DriftOptions)
+def track_drift(source: Source, options: DriftOptions) -> DriftTrack:
     """Measure the drift of the specimen at the centre of each frame, relative to the first one.
 
     What lay at X in the sem frame is seen at X + drift. Where the configuration has no scan timing
-    and the drift shows it, the recording is tracked once more with it.
-
-    Parameters
-    ----------
-    source
-        A bag, a folder of SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
-    calibration
-        A calibration or its file; without it, drift is in raw pixels of the nominal size.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    frame_time_s
-        Seconds of one pass over a frame, in place of what the configuration says.
-    live
-        Whether to return the drift known live, without hindsight from later frames.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
+    and the drift shows it, the recording is tracked once more with it. ``source`` is a bag, a folder of
+    SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
 
     Raises
     ------
@@ -180,8 +179,14 @@ def track_drift(
         track.path.drift_m, track.path.sigma_m      # (n, 2), m
         track.save("drift.csv")
     """
-    model = resolve_calibration(calibration)
-    microscope = resolve_config(config, model, frame_time_s)
+    return track_recording(source, options)
+
+
+def track_recording(source: Source, options: DriftOptions) -> DriftTrack:
+    """As :func:`track_drift`, for options that are an object already."""
+    live, on_progress = options.live, options.on_progress
+    model = resolve_calibration(options.calibration)
+    microscope = resolve_config(options.config, model, options.frame_time_s)
     with open_source(source, microscope) as opened:
         stamps_ns, follower = _follow(opened, model, microscope, on_progress)
         on_progress("smoothing", 0, None)

@@ -44,8 +44,6 @@ from joblib import Parallel, delayed
 import semcal_ros
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 
-__all__ = ["Workers", "open_workers"]
-
 Result = TypeVar("Result")
 
 # Items under way for each core of a cluster: one that is computed, one that waits beside it, and

@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rclpy.clock import Clock
 
 from semcal_ros.bridge.static_frames import fill_static_frames, static_frames
 from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.nodes.frames import static_frames as output
+from semcal_ros.nodes import parameter_server as output
+from tests.helpers.node_fakes import fake_context
 from tests.helpers.node_scenes import make_calibration
 
 CONFIG = load_config("virtual_sem")
@@ -88,7 +88,7 @@ def test_they_are_published_once_and_again_when_they_change(
         latched_publisher=lambda _kind, topic: SimpleNamespace(publish=sent.append, topic=topic)
     )
     monkeypatch.setattr(output, "message_class", lambda name: lambda: blank_message(name))
-    frames = output.StaticFramesOutput(TURNED, endpoints, Clock())
+    frames = output.StaticFramesOutput(fake_context(endpoints, TURNED))
     calibration = make_calibration()
     for g in (1000.0, 1000.0, 2000.0):
         frames.publish(calibration.at(g))

@@ -25,11 +25,10 @@ from scipy.integrate import solve_ivp
 
 from semcal_ros import Calibration
 from semcal_ros.cli import calibrate_command
-from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import SquareAssignment
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
-from semcal_ros.workflows.calibrate import RecordingCalibration
+from semcal_ros.workflows.calibrate import CalibrateOptions, RecordingCalibration
 from semcal_ros.workflows.find_grid import CollectedViews
 from tests.helpers.calibrations import calibrated
 from tests.helpers.semcal_runs import refused, run
@@ -46,8 +45,8 @@ pytestmark = pytest.mark.slow
 def printed(monkeypatch, tmp_path, capsys):
     """What the command prints for corners that are found already, and the calibration file."""
 
-    def found(_recording, *, options: CalibrationOptions, **_):
-        result = calibrated("jsm820", options, MAGNIFICATIONS, VIEWS)
+    def found(_recording, asked: CalibrateOptions, **_):
+        result = calibrated("jsm820", asked.of_core(), MAGNIFICATIONS, VIEWS)
         nothing = np.zeros(0)
         squares = SquareAssignment(nothing, 1.0, nothing)
         collected = CollectedViews((), (), (), squares, result.model.image_size)

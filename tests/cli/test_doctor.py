@@ -32,9 +32,8 @@ from semcal_ros.cli import main
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.doctor import environment_checks as checks
-from semcal_ros.doctor.calibration_checks import check_calibration, describe_calibration
-from semcal_ros.doctor.diagnosis import evaluate
-from semcal_ros.doctor.findings import Finding, Severity
+from semcal_ros.doctor.diagnosis import check_calibration, describe_calibration, evaluate
+from semcal_ros.doctor.findings import CheckResult, Severity
 from semcal_ros.doctor.graph_checks import (
     check_nodes,
     check_parameters,
@@ -49,8 +48,8 @@ from semcal_ros.doctor.observations import (
     Environment,
     Graph,
     ImageSeen,
+    NodeStatus,
     Session,
-    Status,
 )
 from semcal_ros.doctor.stream_checks import (
     check_conditions,
@@ -94,7 +93,7 @@ AROUND = Environment(
 )
 
 
-def only(found: list[Finding], level: Severity, *words: str) -> None:
+def only(found: list[CheckResult], level: Severity, *words: str) -> None:
     """There is one finding, of this level and with these words."""
     assert [finding.level for finding in found] == [level], found
     for word in words:
@@ -103,7 +102,7 @@ def only(found: list[Finding], level: Severity, *words: str) -> None:
         assert "; " in str(found[0]), "a problem without advice"
 
 
-def worst(found: list[Finding]) -> set[Severity]:
+def worst(found: list[CheckResult]) -> set[Severity]:
     return {finding.level for finding in found}
 
 
@@ -413,7 +412,7 @@ def session(**changes: Any) -> Session:
         image=ImageSeen(96, 96, "mono8", 96 * 96),
         reading=MagnificationReading(1000.0, None, CONFIG),
         stage=StageReading(0.1, 0.2),
-        statuses=(Status("/sem/rectifier", 0, "10 Hz"),),
+        statuses=(NodeStatus("/sem/rectifier", 0, "10 Hz"),),
     )
     return replace(made, **changes)
 
@@ -478,7 +477,7 @@ def test_the_output_keeps_up(made: int, level: Severity) -> None:
 
 
 def test_magnification() -> None:
-    def found(heard: Session, config: MicroscopeConfig = CONFIG) -> list[Finding]:
+    def found(heard: Session, config: MicroscopeConfig = CONFIG) -> list[CheckResult]:
         return check_magnification(MAGNIFICATION, describe_magnifications(heard, config), heard)
 
     only(found(session()), OK, "1000")
@@ -548,7 +547,7 @@ def test_what_the_stage_says() -> None:
 def test_diagnostics() -> None:
     only(check_diagnostics(session(), "/sem"), OK, "10 Hz")
     for level, expected in ((1, NOTE), (2, PROBLEM), (3, PROBLEM)):
-        said = session(statuses=(Status("/sem/rectifier", level, "uncalibrated"),))
+        said = session(statuses=(NodeStatus("/sem/rectifier", level, "uncalibrated"),))
         only(check_diagnostics(said, "/sem"), expected, "/sem/rectifier", "uncalibrated")
     only(check_diagnostics(session(statuses=()), "/sem"), NOTE, "no diagnostics")
 
@@ -560,7 +559,7 @@ def calibrated(
     g: float | None = 1000.0,
     size: tuple[int, int] | None = (96, 96),
     config: MicroscopeConfig = CONFIG,
-) -> list[Finding]:
+) -> list[CheckResult]:
     seen = describe_calibration("cal.yaml", CALIBRATION, g, size)
     return check_calibration(seen, size, g, config)
 
@@ -596,7 +595,7 @@ def test_another_display_and_no_calibration() -> None:
 # -- all together ----------------------------------------------------------------------------------
 
 
-def judged(heard: Session, given: tuple[str, Any] | None = None) -> list[Finding]:
+def judged(heard: Session, given: tuple[str, Any] | None = None) -> list[CheckResult]:
     return evaluate(heard, AROUND, ("generic", CONFIG), given, "/sem")
 
 

@@ -34,12 +34,11 @@ from semcal_ros.config.config import (
     MicroscopeConfig,
     StageConfig,
     StageSigmas,
-    config_names,
     config_schema,
     load_config,
     parse_config,
 )
-from semcal_ros.config.files import load_yaml
+from semcal_ros.config.files import config_names, load_yaml
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 

@@ -25,6 +25,7 @@ import click
 import pytest
 
 from semcal_ros.config.config import parse_config
+from semcal_ros.nodes.common.base import node_class
 from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
 from tests.helpers.listings import listings
 from tests.helpers.project import NODES, ROOT
@@ -96,10 +97,8 @@ def test_options_of_listed_commands_exist() -> None:
 
 
 def _declared(node: str) -> set[str]:
-    module = import_module(f"semcal_ros.nodes.{node}")
-    (kind,) = (public for public in module.__all__ if public != "main")
     with starting_with(["--help"]), pytest.raises(HelpWanted) as wanted:
-        getattr(module, kind)()
+        node_class(node)()
     return {declaration.name for declaration in wanted.value.declarations}
 
 

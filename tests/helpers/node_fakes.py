@@ -23,6 +23,8 @@ from typing import Any
 
 from rclpy.clock import Clock
 
+from semcal_ros.config.config import MicroscopeConfig, load_config
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.reporter import Reporter
 
 
@@ -109,6 +111,18 @@ def fake_reporter() -> tuple[Reporter, list[str]]:
     """A reporter, and the list of what it logs."""
     log: list[str] = []
     return Reporter(SimpleNamespace(info=log.append, warning=log.append), Clock()), log
+
+
+def fake_context(
+    endpoints: Any,
+    config: MicroscopeConfig | str = "generic",
+    parameters: Any = None,
+    reporter: Any = None,
+) -> NodeContext:
+    """What a node hands its inputs and outputs; without a node that runs."""
+    node: Any = SimpleNamespace(get_clock=Clock)
+    chosen = load_config(config) if isinstance(config, str) else config
+    return NodeContext(node, chosen, parameters, endpoints, reporter or fake_reporter()[0])
 
 
 def notes(reporter: Reporter) -> dict[str, str]:

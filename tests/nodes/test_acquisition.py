@@ -33,7 +33,7 @@ from std_msgs.msg import Float64
 from semcal_ros import extend
 from semcal_ros.calibration import Calibration
 from semcal_ros.synthetic import preset
-from semcal_ros.workflows.calibrate import calibrate_recording
+from semcal_ros.workflows.calibrate import CalibrateOptions, calibrate_recording
 from tests.helpers.calibrations import calibrated
 from tests.helpers.project import ROOT
 from tests.helpers.ros_process import LATCHED, RELIABLE, Peer, running
@@ -149,7 +149,7 @@ def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl
         assert np.all(stated < 0.05)
     # Four visits with two tilts; the recording has each of them, and gives as many views.
     assert calibration.provenance is not None and len(calibration.provenance.views) == 8
-    again = calibrate_recording(tmp_path / "cal_views_2", config="virtual_sem")
+    again = calibrate_recording(tmp_path / "cal_views_2", CalibrateOptions(config="virtual_sem"))
     assert len(again.collected.views) >= 8
     readings = [view.stage for view in again.collected.views]
     tilts = {round(np.degrees(r.tilt_rad) / 30.0) for r in readings if r is not None and r.tilt_rad}

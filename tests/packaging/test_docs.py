@@ -39,7 +39,7 @@ from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.synthetic import preset
 from tests.helpers.node_scenes import make_calibration
-from tests.helpers.project import NODES, ROOT
+from tests.helpers.project import NODES, ROOT, load_script
 
 DOC = ROOT / "doc"
 PAGES = [ROOT / "README.md", *sorted(DOC.rglob("*.md"))]
@@ -154,6 +154,13 @@ def test_every_option_is_described(command: str) -> None:
     assert {name for name in options if name not in text} == set()
 
 
+def test_the_tables_of_options_are_those_of_the_commands() -> None:
+    scripts = load_script("option_tables")
+    page = _text("cli.md")
+    assert len(scripts.TABLE.findall(page)) >= 4
+    assert scripts.write_tables(page) == page, "run python scripts/option_tables.py"
+
+
 def test_named_options_exist() -> None:
     """Options in the examples and descriptions of the command line."""
     known = {"--help", "--version"}
@@ -183,8 +190,7 @@ class _Captured(Exception):
 
 def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, ParameterDeclaration]:
     """What a node declares, without ROS at work."""
-    module = importlib.import_module(f"semcal_ros.nodes.{node}")
-    (kind,) = (name for name in module.__all__ if name != "main")
+    kind = base.node_class(node)
     captured: dict[str, ParameterDeclaration] = {}
 
     def capture(_node: Any, declarations: Iterable[ParameterDeclaration]) -> None:
@@ -194,7 +200,7 @@ def _settings_of(node: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Parame
     monkeypatch.setattr(Node, "__init__", lambda *_args, **_kwargs: None)
     monkeypatch.setattr(base, "Parameters", capture)
     with pytest.raises(_Captured):
-        getattr(module, kind)()
+        kind()
     return captured
 
 

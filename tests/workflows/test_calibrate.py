@@ -36,7 +36,12 @@ from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.images.write import PixelScale, write_image
 from semcal_ros.synthetic import Detector, calibration_plan, preset
 from semcal_ros.workflows import calibrate as workflow
-from semcal_ros.workflows.calibrate import calibrate_found, calibrate_recording, options_for
+from semcal_ros.workflows.calibrate import (
+    CalibrateOptions,
+    calibrate_found,
+    calibrate_recording,
+    options_for,
+)
 from semcal_ros.workflows.find_grid import collect_views, count_visits, find_views
 from tests.helpers.corner_boards import Board
 from tests.helpers.dot_grids import PatternBoard
@@ -352,10 +357,10 @@ def test_options_win_over_the_configuration():
 
 @pytest.mark.long
 def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
-    off = CalibrationOptions(residual="off")
-    plain = calibrate_recording(_recorded(tmp_path / "plain", only=1000.0), options=off)
+    off = CalibrateOptions(residual="off")
+    plain = calibrate_recording(_recorded(tmp_path / "plain", only=1000.0), off)
     wrong = _recorded(tmp_path / "wrong", lambda i: {"tilt": 10.0 * i}, only=1000.0)
-    done = calibrate_recording(wrong, options=off)
+    done = calibrate_recording(wrong, off)
     assert _numbers(done.calibration) == _numbers(plain.calibration)
     origin = done.calibration.provenance
     assert (origin.recording, origin.configuration) == ("wrong", "generic")
@@ -364,7 +369,7 @@ def test_a_bad_stage_leaves_the_calibration_as_it_is_without_one(tmp_path):
     assert any("looks like degrees" in note for note in done.notes)
     # Small angles in degrees could be radians: only the views tell.
     tilted = _recorded(tmp_path / "small", lambda _: {"tilt": 1.0}, only=1000.0)
-    small = calibrate_recording(tilted, options=off)
+    small = calibrate_recording(tilted, off)
     (told,) = (w for w in small.result.warnings if "contradict the tilt of the stage" in w)
     count = sum(frame.magnification == 1000.0 for frame in PLAN.frames)
     assert told.startswith(f"scale: {count} of {count} views contradict the tilt of the stage")
@@ -392,9 +397,11 @@ def test_files_are_untilted_by_name_and_the_certificate_is_kept(tmp_path, monkey
     monkeypatch.setattr(workflow, "calibrate_views", look)
     done = calibrate_recording(
         folder,
-        config=replace(load_config("generic"), grid_certificate="PTB 4711"),
-        magnification=1000.0,
-        options=CalibrationOptions(untilted=(name,)),
+        CalibrateOptions(
+            config=replace(load_config("generic"), grid_certificate="PTB 4711"),
+            magnification=1000.0,
+            untilted=(name,),
+        ),
     )
     assert chosen == [("frame 1",)]
     assert done.calibration.statistics["grid_certificate"] == "PTB 4711"
@@ -410,8 +417,8 @@ def test_the_reference_recording_with_a_stage(reference_data, monkeypatch):
         "named_frames",
         lambda *args: (f for k, f in enumerate(every(*args)) if k % 4 < 2),
     )
-    off = CalibrationOptions(residual="off")
-    done = calibrate_recording(reference_data / "grid_real_stage", options=off)
+    off = CalibrateOptions(residual="off")
+    done = calibrate_recording(reference_data / "grid_real_stage", off)
     views = done.result.views
     assert len(views) == 40
     assert all(v.stage is not None and v.stage.tilt_rad is not None for v in views)

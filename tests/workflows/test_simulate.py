@@ -29,7 +29,7 @@ from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import STAGES, make_stage, preset
 from semcal_ros.workflows.describe_recording import describe_recording
-from semcal_ros.workflows.simulate import plan_recording, simulate
+from semcal_ros.workflows.simulate import SimulationOptions, plan_recording, simulate
 
 SCOPE = preset("ideal").with_image_size(64, 64)
 
@@ -67,7 +67,7 @@ def test_a_simulated_recording_contains_what_was_asked_for(tmp_path):
     ("kind", "frames"), [("grid", 2 * 21), ("drift", 48), ("steps", 3 * 12), ("zoom", 36)]
 )
 def test_every_plan_has_its_defaults(kind, frames):
-    assert len(plan_recording(kind, SCOPE, views=2)) == frames
+    assert len(plan_recording(SCOPE, SimulationOptions(kind, views=2))) == frames
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_every_plan_has_its_defaults(kind, frames):
 )
 def test_plans_that_cannot_be_made_are_refused(kind, arguments, reason):
     with pytest.raises(InvalidValueError, match=reason):
-        plan_recording(kind, SCOPE, **arguments)
+        plan_recording(SCOPE, SimulationOptions(kind, **arguments))
 
 
 def test_the_stage_is_recorded_as_the_configuration_reads_it(tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ class DatabarFinder:
         self._size: tuple[int, ...] = ()
         self._bar: NDArray[Any] | None = None
 
-    def look(self, image: NDArray[Any]) -> int | None:
+    def find_rows(self, image: NDArray[Any]) -> int | None:
         """Return the rows of a bar below this image, or None if the next image has to tell.
 
         An image without a bar decides at once, one with a bar by the text that it shares with the next one. Of an image
@@ -172,7 +172,7 @@ class DatabarCutter:
             The image has no more rows than the bar was stated to have.
         """
         if self._finder is not None:
-            rows = self._finder.look(image)
+            rows = self._finder.find_rows(image)
             if rows is None:
                 return None
             self.rows = rows

@@ -496,7 +496,7 @@ def _cut_databars(
     stored = ImageSeries(tuple(examined), display_width_m, (), ())
     for image, pixels in stored.read():
         if isinstance(pixels, np.ndarray):
-            finders.setdefault(image.page.size_px, DatabarFinder()).look(pixels)
+            finders.setdefault(image.page.size_px, DatabarFinder()).find_rows(pixels)
     bars = {size: finder.candidate for size, finder in finders.items() if finder.candidate}
     if not bars:
         return images, []

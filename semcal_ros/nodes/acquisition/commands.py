@@ -24,16 +24,13 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from semcal_ros.config.config import StageConfig
 from semcal_ros.core.errors import MicroscopeError
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import latched
-
-__all__ = ["MicroscopeCommands"]
 
 # Stages turn by some degrees per second; nothing that is asked for here is farther than a full turn.
 _ANSWER_S = 120.0
@@ -49,26 +46,18 @@ class MicroscopeCommands:
 
     Parameters
     ----------
-    node, endpoints
-        The node that asks.
+    context
+        Of the node that asks; its configuration says how the joints are called in messages.
     name
         Name of the node that is asked.
-    stage
-        How the joints are called in messages; None for the usual names.
     still_wanted
         Asked while waiting; if it returns False, the wait ends with an error.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        endpoints: Endpoints,
-        name: str,
-        stage: StageConfig | None,
-        still_wanted: Callable[[], bool],
-    ) -> None:
+    def __init__(self, context: NodeContext, name: str, still_wanted: Callable[[], bool]) -> None:
+        endpoints = context.endpoints
         self._name = name
-        self._stage = stage or StageConfig()
+        self._stage = context.config.stage or StageConfig()
         self._still_wanted = still_wanted
         self._changed = threading.Condition()
         self._answer: dict[str, str] = {}

@@ -35,8 +35,6 @@ from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 
-__all__ = ["GridFollower", "Lookout"]
-
 # Moves to bring a grid to the middle: what is seen of it at first may be a corner only.
 _MOST_MOVES = 6
 # A move after which it is off by more than this part of what it was has gone the wrong way.
@@ -49,10 +47,10 @@ Posture = Mapping[str, float]
 """Angles of the joints, rad."""
 
 
-class Lookout(Protocol):
-    """What looks at the newest picture."""
+class GridFinder(Protocol):
+    """What finds the grid in the newest picture."""
 
-    def look(self) -> LatticeDetection | None:
+    def find_grid(self) -> LatticeDetection | None:
         """Return the corners of the newest picture, or None without a grid."""
 
     def wait_for_pictures(self, count: int) -> None:
@@ -64,8 +62,8 @@ class GridFollower:
 
     Parameters
     ----------
-    lookout
-        Looks.
+    finder
+        Finds the grid in the newest picture.
     commands
         Moves.
     show
@@ -73,9 +71,9 @@ class GridFollower:
     """
 
     def __init__(
-        self, lookout: Lookout, commands: MicroscopeCommands, show: Callable[[str], None]
+        self, finder: GridFinder, commands: MicroscopeCommands, show: Callable[[str], None]
     ) -> None:
-        self._lookout = lookout
+        self._finder = finder
         self._commands = commands
         self._show = show
         self._last: Posture | None = None
@@ -105,7 +103,7 @@ class GridFollower:
         """
         if self._commands.place() is None:
             return False
-        seen = self._lookout.look()
+        seen = self._finder.find_grid()
         if seen is not None:
             if grid_is_centred(seen):
                 return False
@@ -121,7 +119,7 @@ class GridFollower:
         self._show("the grid has left the image: going back to where it was seen")
         at, step = 0.0, 0.5
         self._stand(start, goal)
-        if self._lookout.look() is None:
+        if self._finder.find_grid() is None:
             raise CalibrationError(
                 "the grid is not where it was seen last",
                 do="look at the microscope, then call ~/acquire to go on",
@@ -131,7 +129,7 @@ class GridFollower:
             part = min(1.0, at + step)
             there = {j: start[j] + part * (goal[j] - start[j]) for j in goal}
             self._stand(there, here)
-            seen = self._lookout.look()
+            seen = self._finder.find_grid()
             if seen is None:
                 self._stand(here, there)
                 step *= 0.5
@@ -150,7 +148,7 @@ class GridFollower:
 
     def _stand(self, posture: Posture, before: Posture) -> None:
         self._commands.move(posture, before)
-        self._lookout.wait_for_pictures(_PICTURES)
+        self._finder.wait_for_pictures(_PICTURES)
 
     def _centre(self, request: ViewRequest, seen: LatticeDetection, posture: Posture) -> None:
         # The tilt shortens one direction, which the next look corrects.
@@ -193,10 +191,10 @@ class GridFollower:
             raise CalibrationError("the stage does not tell x and y any more")
         target = {"x": place[0] + float(way_m[0]), "y": place[1] + float(way_m[1])}
         self._commands.move(target, {})
-        self._lookout.wait_for_pictures(_PICTURES)
+        self._finder.wait_for_pictures(_PICTURES)
 
     def _seen(self) -> LatticeDetection:
-        seen = self._lookout.look()
+        seen = self._finder.find_grid()
         if seen is None:
             raise CalibrationError("the grid was lost while it was moved to the middle")
         return seen

@@ -40,15 +40,6 @@ from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 from semcal_ros.nodes.acquisition.run import AWAY, Run, Taker
 from semcal_ros.nodes.common.parameters import Parameters
 
-__all__ = [
-    "LadderGoal",
-    "LadderRun",
-    "LadderTaker",
-    "describe_picture",
-    "ladder_goal_of",
-    "place_of",
-]
-
 # Moves to bring the place to the middle: the first one is right to the distortion, the second to the backlash.
 _MOST_MOVES = 4
 # The picture that is being scanned on arrival, and the first that is scanned after it.

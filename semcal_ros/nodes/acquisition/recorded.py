@@ -33,8 +33,6 @@ from semcal_ros.files.recordings import RecordedFrame, open_recording
 from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import count_visits
 
-__all__ = ["Judge", "RecordedView", "read_pictures", "read_views"]
-
 #: Says whether a picture is one of the views: its magnification, grey levels, corners, and the stage.
 Judge = Callable[[float, NDArray[Any], LatticeDetection, StageReading | None], bool]
 

@@ -41,20 +41,8 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError, Microsco
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.wording import counted
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
-from semcal_ros.nodes.acquisition.follow import GridFollower, Lookout, Posture
+from semcal_ros.nodes.acquisition.follow import GridFinder, GridFollower, Posture
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
-
-__all__ = [
-    "ACQUISITION",
-    "AWAY",
-    "AcquisitionRun",
-    "Progress",
-    "Run",
-    "Taker",
-    "ViewTaker",
-    "describe_request",
-    "goal_of",
-]
 
 ACQUISITION = (
     ParameterDeclaration(
@@ -199,7 +187,7 @@ class Taker(Protocol):
         """Tell how far the run is."""
 
 
-class ViewTaker(Lookout, Taker, Protocol):
+class ViewTaker(GridFinder, Taker, Protocol):
     """What makes views, and calibrates from them."""
 
     def calibrate(self) -> Calibration:

@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib import import_module
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
@@ -39,6 +40,7 @@ from semcal_ros.bridge.diagnostics import (
 from semcal_ros.config.config import load_config
 from semcal_ros.core.wording import nearest_name
 from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import (
@@ -48,8 +50,6 @@ from semcal_ros.nodes.common.parameters import (
     Parameters,
 )
 from semcal_ros.nodes.common.reporter import Reporter
-
-__all__ = ["DEFAULT_NAMESPACE", "SemNode"]
 
 DEFAULT_NAMESPACE = "sem"
 """Namespace of a node that is started without one. All topics have relative names, and the nodes of one microscope
@@ -73,6 +73,8 @@ class SemNode(Node):
     parameters, endpoints, reporter
         The values of the parameters; the factory of publishers, subscriptions and services; the counters and
         the log.
+    node_context
+        All of these, for inputs and outputs that are objects of their own.
     closing
         What to close before the node is destroyed, in reverse order. A node whose constructor failed is destroyed
         too, and closes what it had opened.
@@ -96,6 +98,9 @@ class SemNode(Node):
         self.config = load_config(self.parameters["config"])
         self.endpoints = Endpoints(self)
         self.reporter = Reporter(self.get_logger(), self.get_clock())
+        self.node_context = NodeContext(
+            self, self.config, self.parameters, self.endpoints, self.reporter
+        )
         if unused and not command_line().of_several:
             self.reporter.warn(f"not parameters of this node, and ignored: {', '.join(unused)}")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -224,3 +229,15 @@ class SemNode(Node):
         array.header.stamp = self.get_clock().now().to_msg()
         array.status = [self.status()]
         self._diagnostics.publish(array)
+
+
+def node_class(executable: str) -> type[SemNode]:
+    """Return the class of the node that an executable runs."""
+    module = import_module(f"semcal_ros.nodes.{executable}")
+    (kind,) = (
+        made
+        for made in vars(module).values()
+        if isinstance(made, type) and issubclass(made, SemNode)
+        if made.__module__ == module.__name__
+    )
+    return kind

@@ -26,15 +26,6 @@ from semcal_ros.core.wording import nearest_name
 from semcal_ros.files.parameter_file import ParameterSection, read_parameter_sections
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 
-__all__ = [
-    "CommandLine",
-    "HelpWanted",
-    "command_line",
-    "is_quality",
-    "starting_with",
-    "unknown_parameter",
-]
-
 _HELP = ("-h", "--help")
 # rclpy declares these by itself.
 _OF_ROS = ("use_sim_time", "start_type_description_service")

@@ -35,8 +35,6 @@ from semcal_ros.nodes.common.qos import (
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, MessageInfo
 
-__all__ = ["Endpoints", "Guard"]
-
 Post = Callable[[Callable[[], None]], None]
 
 

@@ -22,8 +22,6 @@ from dataclasses import dataclass
 
 from semcal_ros.nodes.common.parameters import DIRECTORY, ParameterDeclaration
 
-__all__ = ["EXECUTABLES", "ExecutableHelp", "format_help"]
-
 _WIDTH = 100  # characters
 
 

@@ -22,8 +22,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Generic, Protocol, TypeVar
 
-__all__ = ["LatestWorker"]
-
 Item = TypeVar("Item", bound=Any)
 Result = TypeVar("Result")
 

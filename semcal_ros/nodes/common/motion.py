@@ -21,7 +21,6 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
@@ -34,12 +33,9 @@ from semcal_ros.config.config import StageConfig
 from semcal_ros.core.errors import MicroscopeError, SemcalError
 from semcal_ros.drivers.limits import MotionLimits, describe_target, joint_unit
 from semcal_ros.drivers.source import JOINTS
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import stream_output
-from semcal_ros.nodes.common.reporter import Reporter
-
-__all__ = ["MOTION", "MotionInterface", "Performer", "motion_with"]
 
 # Least, greatest and longest step of each joint. Stages of SEMs tilt from some degrees below 0 to 60 or more; a
 # specimen that is higher than another touches the pole piece on its way up, so that z is locked unless someone says how
@@ -114,36 +110,26 @@ class MotionInterface:
 
     Parameters
     ----------
-    node, endpoints, parameters, reporter
-        Of the node, which declares :data:`MOTION`.
-    stage
-        How the joints are called in messages; None for the usual names.
+    context
+        Of the node, which declares :data:`MOTION`; its configuration says how the joints are called in messages.
     performer
         What does the moving.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        endpoints: Endpoints,
-        parameters: Parameters,
-        reporter: Reporter,
-        stage: StageConfig | None,
-        performer: Performer,
-    ) -> None:
-        self._name = node.get_fully_qualified_name()
-        self._parameters = parameters
-        self._reporter = reporter
+    def __init__(self, context: NodeContext, performer: Performer) -> None:
+        self._name = context.node.get_fully_qualified_name()
+        self._parameters = context.parameters
+        self._reporter = context.reporter
         self._performer = performer
-        source = stage or StageConfig()
+        source = context.config.stage or StageConfig()
         self._joints = {getattr(source, joint): joint for joint in JOINTS}
         self._number = 0
         self._command, self._asked = "", ""
         self._busy = False
         self.failure = ""
-        self._status = endpoints.latched_publisher(DiagnosticStatus, "~/motion")
+        self._status = context.endpoints.latched_publisher(DiagnosticStatus, "~/motion")
         self._subscriptions = [
-            node.create_subscription(kind, topic, callback, stream_output(10))
+            context.node.create_subscription(kind, topic, callback, stream_output(10))
             for kind, topic, callback in (
                 (Float64, "~/set_magnification", self._on_magnification),
                 (JointState, "~/move_stage", self._on_move),

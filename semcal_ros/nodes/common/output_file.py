@@ -23,8 +23,6 @@ from pathlib import Path
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 
-__all__ = ["OUTPUT", "OutputFile"]
-
 _SUFFIXES = (".yaml", ".yml")
 
 OUTPUT = ParameterDeclaration(

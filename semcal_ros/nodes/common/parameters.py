@@ -34,17 +34,6 @@ from rclpy.parameter import Parameter
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.confined import AllowedPaths
 
-__all__ = [
-    "CALIBRATION",
-    "CONFIG",
-    "DIAGNOSTICS_PERIOD",
-    "DIRECTORY",
-    "INTERPOLATION",
-    "REPLAYED_CALIBRATION",
-    "ParameterDeclaration",
-    "Parameters",
-]
-
 Check = Callable[[Any], object]
 Apply = Callable[[Any], None]
 

@@ -25,8 +25,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message
 
-__all__ = ["MemoryReceiver", "PatientPublisher"]
-
 # Fast DDS waits 100 ms by itself before it refuses, so these are a second. A stream does not want to wait for longer.
 _TRIES = 10
 

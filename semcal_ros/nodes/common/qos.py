@@ -29,18 +29,6 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-__all__ = [
-    "camera_output",
-    "glimpse_input",
-    "image_input",
-    "latched",
-    "overridable",
-    "relax",
-    "service_queue",
-    "stream_output",
-    "value_input",
-]
-
 # Limit of the middleware, which counts in signed 32 bit integers.
 _LARGEST_DEPTH = 2**31 - 1
 # As many as parameter services keep: with the usual ten, requests of busy clients would be lost and never answered.

@@ -25,8 +25,6 @@ from rclpy.clock import Clock
 from semcal_ros.bridge.diagnostics import StreamStatistics
 from semcal_ros.core.errors import SemcalError
 
-__all__ = ["NODE_ERRORS", "Reporter"]
-
 NODE_ERRORS = (SemcalError, cv2.error)
 """What a message can cause; a node counts it, reports it and goes on."""
 

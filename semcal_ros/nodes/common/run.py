@@ -54,8 +54,6 @@ from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.command_line import CommandLine, HelpWanted, starting_with
 from semcal_ros.nodes.common.help import format_help
 
-__all__ = ["Part", "Parts", "run_node", "run_parts"]
-
 Made = TypeVar("Made")
 
 

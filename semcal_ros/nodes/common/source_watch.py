@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["SourceWatch"]
-
 # A person who starts things one after the other is not told at once; who waits for an image is told soon.
 _SILENT_S = 5.0
 # Fast DDS forgets a process that was killed after 20 s; until then its successor of the same name is not alone.

@@ -30,8 +30,6 @@ from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 from semcal_ros.nodes.common.qos import overridable, relax
 from semcal_ros.nodes.common.source_watch import SourceWatch
 
-__all__ = ["AdaptiveSubscription", "MessageCounter", "MessageInfo", "published_ns"]
-
 MessageInfo = Mapping[str, Any]
 Callback = Callable[[Any, MessageInfo], None]
 

@@ -28,7 +28,6 @@ from semcal_ros.core.camera.calibrated_frame import (
     rectified_projection,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.nodes.common.parameters import (
     CALIBRATION,
     INTERPOLATION,
@@ -45,8 +44,6 @@ from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node without drift does not
     from semcal_ros.nodes.frames.live_drift import FrameDrift
 
-__all__ = ["CalibratedStreamNode"]
-
 _WITHOUT_CAMERA = (
     ParameterDeclaration(
         "uncalibrated",
@@ -61,7 +58,7 @@ _WITHOUT_CAMERA = (
 
 
 class CalibratedStreamNode(StreamNode):
-    """A stream node with a calibration, a rectifier, and the outputs of :class:`RectifiedOutput`."""
+    """A stream node with a calibration, and the outputs of :class:`RectifiedOutput`."""
 
     def __init__(self, name: str, declarations: Iterable[ParameterDeclaration] = ()) -> None:
         super().__init__(
@@ -75,22 +72,12 @@ class CalibratedStreamNode(StreamNode):
                 *declarations,
             ),
         )
-        self.rectifier = Rectifier(self.parameters["interpolation"])
-        self.parameters.on_change("interpolation", self._set_interpolation)
-        self.calibration = CalibrationInput(
-            self.config,
-            self.parameters,
-            self.endpoints,
-            self.reporter,
-            on_change=self.on_calibration,
-        )
-        self.output = RectifiedOutput(self.config, self.parameters, self.endpoints, self.reporter)
+        self.calibration = CalibrationInput(self.node_context, on_change=self.on_calibration)
+        self.output = RectifiedOutput(self.node_context)
         # After the last compressed image.
         self.closing.callback(self.output.close)
         self._range = RangeWatch(self.reporter)
-        self._watch = ConditionsWatch(
-            self.endpoints, self.reporter, lambda: self.calibration.current
-        )
+        self._watch = ConditionsWatch(self.node_context, lambda: self.calibration.current)
         self._dropped = 0
         self._refused = 0
         # Only the latest: most frames have the magnification of the frame before.
@@ -106,9 +93,6 @@ class CalibratedStreamNode(StreamNode):
         super().receive_frames(
             on_frame, magnification_config=lambda: self.calibration.config, **options
         )
-
-    def _set_interpolation(self, value: str) -> None:
-        self.rectifier = Rectifier(value)
 
     def camera(self, frame: StreamFrame, magnification: float) -> ScanCamera | None:
         """Return the calibrated camera of a frame, or None while there is no calibration."""

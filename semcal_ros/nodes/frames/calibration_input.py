@@ -35,14 +35,12 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import read_calibration_text
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.latest_worker import LatestWorker
-from semcal_ros.nodes.common.parameters import CALIBRATION, REPLAYED_CALIBRATION, Parameters
+from semcal_ros.nodes.common.parameters import CALIBRATION, REPLAYED_CALIBRATION
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
-
-__all__ = ["CalibrationInput", "calibration_digest", "report_scale_warnings"]
 
 _TOPIC = "topic"
 # Largest accepted difference between the middleware's clock and that of this process.
@@ -121,13 +119,9 @@ class CalibrationInput:
 
     Parameters
     ----------
-    config
-        The configuration of the node.
-    parameters
-        Parameters among which are :data:`~semcal_ros.nodes.common.parameters.CALIBRATION` and
+    context
+        Of the node; among its parameters are :data:`~semcal_ros.nodes.common.parameters.CALIBRATION` and
         :data:`~semcal_ros.nodes.common.parameters.REPLAYED_CALIBRATION`.
-    endpoints, reporter
-        Where to subscribe, and the log and counters.
     on_change
         Called after each change; not for the file given at start.
 
@@ -138,21 +132,16 @@ class CalibrationInput:
     """
 
     def __init__(
-        self,
-        config: MicroscopeConfig,
-        parameters: Parameters,
-        endpoints: Endpoints,
-        reporter: Reporter,
-        *,
-        on_change: Callable[[], None] = lambda: None,
+        self, context: NodeContext, *, on_change: Callable[[], None] = lambda: None
     ) -> None:
+        parameters, endpoints = context.parameters, context.endpoints
         self._parameters = parameters
-        self._reporter = reporter
+        self._reporter = context.reporter
         self._on_change = on_change
         self._checked: tuple[str, _Loaded] | None = None
         self._loaded: _Loaded | None = None
         self._warnings = ScaleWarnings()
-        self._node_config = self._config = config
+        self._node_config = self._config = context.config
         self._published_digests: deque[tuple[int, int, str]] = deque(maxlen=_KEPT_DIGESTS)
         self._parser = LatestWorker(endpoints.guard, _parse, self._on_parsed)
         path = parameters[CALIBRATION.name]

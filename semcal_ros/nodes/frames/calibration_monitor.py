@@ -37,15 +37,13 @@ from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection, SemcalError
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import glimpse_input
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
 from semcal_ros.workflows.check_and_update import check_found
-
-__all__ = ["CalibrationMonitor"]
 
 # One check of a hundred calls a valid calibration degraded, and there are thousands of them: so many in a row have to.
 _IN_A_ROW = 2
@@ -65,7 +63,7 @@ class _Glimpse:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Examined:
     """A check, or the reason why there is none."""
 
     calibration: Calibration
@@ -73,15 +71,17 @@ class _Seen:
     reason: str = ""
 
 
-def _examine(glimpse: _Glimpse) -> _Seen:
+def _examine(glimpse: _Glimpse) -> _Examined:
     try:
         detection = find_lattice(glimpse.image)
         if isinstance(detection, Rejection):
-            return _Seen(glimpse.calibration, None, f"no grid: {detection.reason}")
+            return _Examined(glimpse.calibration, None, f"no grid: {detection.reason}")
         view = FoundView("view 0", glimpse.magnification, None, detection)
-        return _Seen(glimpse.calibration, check_found(glimpse.calibration, [view], glimpse.config))
+        return _Examined(
+            glimpse.calibration, check_found(glimpse.calibration, [view], glimpse.config)
+        )
     except (SemcalError, *_NUMERIC) as error:
-        return _Seen(glimpse.calibration, None, " ".join(str(error).split()))
+        return _Examined(glimpse.calibration, None, " ".join(str(error).split()))
 
 
 class CalibrationMonitor:
@@ -91,10 +91,8 @@ class CalibrationMonitor:
 
     Parameters
     ----------
-    config
-        Topic and type of the images.
-    endpoints, reporter
-        Where to subscribe, the log and the values of the diagnostics.
+    context
+        Of the node.
     magnification
         Tells at which magnification a frame was taken.
     calibration
@@ -105,15 +103,14 @@ class CalibrationMonitor:
 
     def __init__(
         self,
-        config: MicroscopeConfig,
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         magnification: MagnificationInput,
         calibration: Callable[[], tuple[Calibration | None, MicroscopeConfig]],
         period_s: float,
     ) -> None:
-        self._databar = DatabarCutter(config.image.databar_rows)
-        self._reporter = reporter
+        image = context.config.image
+        self._databar = DatabarCutter(image.databar_rows)
+        self._reporter = context.reporter
         self._magnification = magnification
         self._calibration = calibration
         self._period_s = period_s
@@ -121,10 +118,10 @@ class CalibrationMonitor:
         self._number = 0
         self._bad: list[str] = []
         self._reported: tuple[Calibration | None, bool] = (None, False)
-        self._worker = LatestWorker(endpoints.guard, _examine, self._on_seen)
-        self._type = message_class(config.image.type)
-        self._subscription = endpoints.subscribe(
-            self._type, config.image.topic, self._on_bytes, glimpse_input(), raw=True
+        self._worker = LatestWorker(context.endpoints.guard, _examine, self._on_seen)
+        self._type = message_class(image.type)
+        self._subscription = context.endpoints.subscribe(
+            self._type, image.topic, self._on_bytes, glimpse_input(), raw=True
         )
 
     def _on_bytes(self, data: bytes, info: MessageInfo) -> None:
@@ -152,7 +149,7 @@ class CalibrationMonitor:
         self._number += 1
         self._worker.submit(_Glimpse(self._number, grey, g, current, config))
 
-    def _on_seen(self, seen: _Seen) -> None:
+    def _on_seen(self, seen: _Examined) -> None:
         current, _ = self._calibration()
         if seen.calibration is not current:
             return

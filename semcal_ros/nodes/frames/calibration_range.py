@@ -21,8 +21,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.reporter import Reporter
 
-__all__ = ["OUT_OF_RANGE", "RangeWatch"]
-
 OUT_OF_RANGE = ParameterDeclaration(
     "out_of_range",
     "flag",

@@ -29,13 +29,11 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage
 
 from semcal_ros.bridge.compressed import CODECS, fill_compressed
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.latest_worker import LatestWorker
-from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.frames.stream import StreamFrame
-
-__all__ = ["CompressedOutput", "compressed_parameters"]
 
 
 def compressed_parameters(topic: str) -> tuple[ParameterDeclaration, ...]:
@@ -86,11 +84,9 @@ class CompressedOutput:
 
     Parameters
     ----------
-    parameters
-        Parameters among which are :func:`compressed_parameters` of the topic.
-    endpoints, reporter
-        Where to publish, and the counters.
-        topic
+    context
+        Of the node; among its parameters are :func:`compressed_parameters` of the topic.
+    topic
         Topic of the uncompressed images.
 
     Notes
@@ -98,11 +94,10 @@ class CompressedOutput:
     :meth:`close` must be called before the node is destroyed.
     """
 
-    def __init__(
-        self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter, topic: str
-    ) -> None:
-        self._parameters = parameters
-        self._reporter = reporter
+    def __init__(self, context: NodeContext, topic: str) -> None:
+        endpoints = context.endpoints
+        self._parameters = context.parameters
+        self._reporter = context.reporter
         self._topic = f"{topic}/compressed"
         self._prefix = f"{topic}.compressed"
         name = endpoints.below(topic, "compressed")

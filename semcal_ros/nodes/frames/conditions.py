@@ -27,13 +27,10 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.camera.provenance import NOT_RECORDED
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import value_input
-from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo
-
-__all__ = ["ON_MISMATCH", "ConditionsInput", "ConditionsWatch"]
 
 ON_MISMATCH = ParameterDeclaration(
     "on_mismatch",
@@ -50,8 +47,8 @@ class ConditionsInput:
 
     Parameters
     ----------
-    endpoints, reporter
-        Where to subscribe, and the counter of unusable messages.
+    context
+        Of the node.
     on_change
         Called after each change.
     group
@@ -65,15 +62,14 @@ class ConditionsInput:
 
     def __init__(
         self,
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         on_change: Callable[[], None] = lambda: None,
         group: CallbackGroup | None = None,
     ) -> None:
-        self._reporter = reporter
+        self._reporter = context.reporter
         self._on_change = on_change
         self.current: Mapping[str, float | str] = {}
-        self._subscription = endpoints.subscribe(
+        self._subscription = context.endpoints.subscribe(
             DiagnosticStatus, "conditions", self._on_message, value_input(), group
         )
 
@@ -97,21 +93,16 @@ class ConditionsWatch:
 
     Parameters
     ----------
-    endpoints, reporter
-        As for :class:`ConditionsInput`.
+    context
+        Of the node.
     calibration
         Returns the calibration in force, or None.
     """
 
-    def __init__(
-        self,
-        endpoints: Endpoints,
-        reporter: Reporter,
-        calibration: Callable[[], Calibration | None],
-    ) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext, calibration: Callable[[], Calibration | None]) -> None:
+        self._reporter = context.reporter
         self._calibration = calibration
-        self._input = ConditionsInput(endpoints, reporter, self.check)
+        self._input = ConditionsInput(context, self.check)
         self._compared: tuple[object, object] = (None, None)
         self._decisive: tuple[str, ...] = ()
         self._others: tuple[str, ...] = ()

@@ -33,8 +33,6 @@ from semcal_ros.nodes.common.base import DEFAULT_NAMESPACE
 from semcal_ros.nodes.common.run import Part
 from semcal_ros.nodes.frames.stream import is_late
 
-__all__ = ["CONSUMERS", "SKIPPING_DEPTH", "Consumer", "choose_consumers"]
-
 CONSUMERS = "semcal_ros.consumers"
 """The group of entry points."""
 SKIPPING_DEPTH = 10

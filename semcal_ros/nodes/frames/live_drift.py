@@ -17,28 +17,28 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftEstimate
 from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
 from semcal_ros.core.rectification.binning import bin_image
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.reference import RegistrationSettings
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.frames.load_monitor import LoadMonitor
+from semcal_ros.nodes.frames.outputs import DriftOutput, ImageOutput, RectifiedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame
 from semcal_ros.nodes.workers.child_process import ChildProcessEnded
 from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measurement, measure_frame
-
-__all__ = ["DRIFT_PARAMETERS", "FrameDrift", "LiveDrift"]
 
 _RESTARTING = (
     ParameterDeclaration(
@@ -123,35 +123,25 @@ class LiveDrift:
 
     Parameters
     ----------
-    config
-        What the stamps mean, and the raster timing.
-    parameters
-        Parameters among which are :data:`DRIFT_PARAMETERS`.
-    endpoints, reporter
-        Where to serve ``~/reset``, and the counters and the log.
+    context
+        Of the node; among its parameters are :data:`DRIFT_PARAMETERS`.
 
     Notes
     -----
     :meth:`close` must be called before the node is destroyed.
     """
 
-    def __init__(
-        self,
-        config: MicroscopeConfig,
-        parameters: Parameters,
-        endpoints: Endpoints,
-        reporter: Reporter,
-    ) -> None:
-        self._config = config
-        self._parameters = parameters
-        self._reporter = reporter
+    def __init__(self, context: NodeContext) -> None:
+        self._config = context.config
+        self._parameters = context.parameters
+        self._reporter = context.reporter
         self._load = LoadMonitor()
         self._failed = 0
         self._process = DriftProcess()
         for setting in (*_RESTARTING, _DETAIL):
-            parameters.on_change(setting.name, lambda _value: self.reset())
+            self._parameters.on_change(setting.name, lambda _value: self.reset())
         self.reset()
-        self._service = endpoints.trigger_service("~/reset", self._on_reset)
+        self._service = context.endpoints.trigger_service("~/reset", self._on_reset)
 
     def _on_reset(self) -> str:
         self.reset()
@@ -269,6 +259,55 @@ class LiveDrift:
         self._latest = latest
         self._load.add_cost(latest.cost_s)
         self._reporter.note("drift_ms", 1e3 * self._load.cost_s)
+
+
+class DriftCorrection:
+    """Takes the drift out of frames, together with what their camera says of distortion, and publishes it.
+
+    Parameters
+    ----------
+    context
+        Of the node; among its parameters are :data:`DRIFT_PARAMETERS`.
+    closing
+        Gets what is to be closed before the node is destroyed.
+    """
+
+    def __init__(self, context: NodeContext, closing: ExitStack) -> None:
+        self.tracking = LiveDrift(context)
+        closing.callback(self.tracking.close)
+        self._output = DriftOutput(context)
+
+    def correct(
+        self,
+        frame: StreamFrame,
+        camera: ScanCamera,
+        image: ImageOutput | RectifiedOutput,
+        publish: Callable[[FrameDrift | None], None],
+    ) -> None:
+        """Measure the drift of a frame, render the image without it, and publish both.
+
+        A frame that was scanned while the magnification changed has no drift.
+
+        Parameters
+        ----------
+        frame
+            The frame.
+        camera
+            Its scale, and the distortion that is taken out.
+        image
+            Where the image is rendered.
+        publish
+            Publishes it; called with the drift, before that is published.
+        """
+        drift = None if frame.mixed else self.tracking.estimate(frame, camera)
+        image.render(frame, camera, None if drift is None else drift.raster)
+        publish(drift)
+        if drift is not None:
+            self._output.publish(drift, frame)
+
+    def conditions(self) -> list[str]:
+        """Return, in a few words, whether the drift is only predicted."""
+        return [self._output.trouble] * bool(self._output.trouble)
 
 
 def _estimate_at(latest: Measurement, centre_s: float, binned: int) -> FrameDrift:

@@ -20,8 +20,6 @@ import math
 
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["LoadMonitor"]
-
 # Weight of the newest value in a running mean: the mean follows a change within about ten frames
 # and hides a single slow one.
 _WEIGHT = 0.1

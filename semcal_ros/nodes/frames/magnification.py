@@ -30,12 +30,9 @@ from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import value_input
-from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
-
-__all__ = ["MagnificationInput"]
 
 # More changes than can precede a late frame: minutes of a knob turned continuously, in 100 KB.
 _KEPT = 4096
@@ -56,10 +53,8 @@ class MagnificationInput:
 
     Parameters
     ----------
-    config
-        What the topic carries.
-    endpoints, reporter
-        Where to subscribe, and the counter of unusable messages.
+    context
+        Of the node.
     on_reading
         Called with each good reading.
     group
@@ -68,20 +63,18 @@ class MagnificationInput:
 
     def __init__(
         self,
-        config: MicroscopeConfig,
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         on_reading: Callable[[MagnificationReading], None] | None = None,
         group: CallbackGroup | None = None,
     ) -> None:
-        source = config.magnification
-        self._config = config
-        self._reporter = reporter
+        source = context.config.magnification
+        self._config = context.config
+        self._reporter = context.reporter
         self._on_reading = on_reading
         self._history: ZeroOrderHold[MagnificationReading | None] = ZeroOrderHold(_KEPT)
         message_type = message_class(source.type)
         self._has_stamp = optional_stamp_ns(message_type()) is not None
-        self._subscription = endpoints.subscribe(
+        self._subscription = context.endpoints.subscribe(
             message_type,
             source.topic,
             self._on_message,

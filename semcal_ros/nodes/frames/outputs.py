@@ -35,11 +35,11 @@ from semcal_ros.bridge.drift import (
 from semcal_ros.bridge.headers import copy_header
 from semcal_ros.bridge.images import fill_image, pixel_memory
 from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import Parameters
-from semcal_ros.nodes.common.reporter import Reporter
+from semcal_ros.core.rectification.raw_positions import RasterDrift
+from semcal_ros.core.rectification.rectifier import Rectifier
+from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.frames.compressed import CompressedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame
 
@@ -47,13 +47,12 @@ if TYPE_CHECKING:  # the filter behind it needs scipy.optimize, which a node wit
     from semcal_ros.core.drift.estimates import DriftUpdate
     from semcal_ros.nodes.frames.live_drift import FrameDrift
 
-__all__ = ["DriftOutput", "ImageOutput", "RectifiedOutput"]
-
 
 class ImageOutput:
     """Publishes images on one topic, from memory that is reused for each image, and compressed copies beside it.
 
-    The node declares the parameters of :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
+    The node declares :data:`~semcal_ros.nodes.common.parameters.INTERPOLATION` and the parameters of
+    :func:`~semcal_ros.nodes.frames.compressed.compressed_parameters`.
 
     Attributes
     ----------
@@ -63,22 +62,38 @@ class ImageOutput:
         Whether it is; not where the pixels are handed over to others of this process.
     """
 
-    def __init__(
-        self, parameters: Parameters, endpoints: Endpoints, reporter: Reporter, topic: str
-    ) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext, topic: str) -> None:
+        self._reporter = context.reporter
         self._message = Image()
-        self._publisher = endpoints.stream_publisher(Image, topic)
-        self._compressed = CompressedOutput(parameters, endpoints, reporter, topic)
+        self._publisher = context.endpoints.stream_publisher(Image, topic)
+        self._compressed = CompressedOutput(context, topic)
+        self._scan = context.config.scan
+        self._set_interpolation(context.parameters[INTERPOLATION.name])
+        context.parameters.on_change(INTERPOLATION.name, self._set_interpolation)
         self.pixels: NDArray[Any] = np.empty(0)
         self.reuses_memory = True
 
-    def memory(self, frame: StreamFrame) -> NDArray[Any]:
-        """Return the memory for the pixels of the image made from ``frame``."""
+    def render(
+        self, frame: StreamFrame, camera: ScanCamera | None, drift: RasterDrift | None = None
+    ) -> None:
+        """Rectify a frame into the memory, in one interpolation; raises as :meth:`Rectifier.rectify`.
+
+        Parameters
+        ----------
+        frame
+            The raw image, and its header.
+        camera
+            Whose distortion is taken out; None for none.
+        drift
+            What is taken out with it.
+        """
         if not self.reuses_memory:
             self._message = Image()
         self.pixels = pixel_memory(self._message, frame.image, frame.encoding, frame.header)
-        return self.pixels
+        self._rectifier.rectify(frame.image, camera, drift, self._scan, out=self.pixels)
+
+    def _set_interpolation(self, value: str) -> None:
+        self._rectifier = Rectifier(value)
 
     def publish(self, frame: StreamFrame) -> None:
         """Publish the image in the memory."""
@@ -123,26 +138,19 @@ class RectifiedOutput:
 
     Parameters
     ----------
-    config
-        Where the raw images come from.
-    parameters, endpoints, reporter
-        As for :class:`ImageOutput`.
+    context
+        Of the node.
     """
 
-    def __init__(
-        self,
-        config: MicroscopeConfig,
-        parameters: Parameters,
-        endpoints: Endpoints,
-        reporter: Reporter,
-    ) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext) -> None:
+        endpoints = context.endpoints
+        self._reporter = context.reporter
         self._databar_rows = 0
-        self._image = ImageOutput(parameters, endpoints, reporter, "image_rect")
+        self._image = ImageOutput(context, "image_rect")
         sibling, below = endpoints.beside("camera_info", "image_rect"), "image_rect/camera_info"
         matrix = "projection_stamped"
         covariance = "projection_covariance_stamped"
-        raw = config.image.topic
+        raw = context.config.image.topic
         info = _CameraOutput(CameraInfo(), fill_camera_info)
         projection = _CameraOutput(Image(), fill_stamped_projection)
         spread = _CameraOutput(Image(), fill_stamped_projection_covariance)
@@ -176,9 +184,11 @@ class RectifiedOutput:
             ),
         )
 
-    def memory(self, frame: StreamFrame) -> NDArray[Any]:
-        """As :meth:`ImageOutput.memory`."""
-        return self._image.memory(frame)
+    def render(
+        self, frame: StreamFrame, camera: ScanCamera | None, drift: RasterDrift | None = None
+    ) -> None:
+        """As :meth:`ImageOutput.render`."""
+        self._image.render(frame, camera, drift)
 
     def close(self) -> None:
         """As :meth:`ImageOutput.close`."""
@@ -219,8 +229,9 @@ class RectifiedOutput:
 class DriftOutput:
     """Publishes ``drift``, ``drift_velocity`` and ``~/moving``, and notes the state of the tracking."""
 
-    def __init__(self, endpoints: Endpoints, reporter: Reporter) -> None:
-        self._reporter = reporter
+    def __init__(self, context: NodeContext) -> None:
+        endpoints = context.endpoints
+        self._reporter = context.reporter
         self._drift = endpoints.stream_publisher(PoseWithCovarianceStamped, "drift")
         self._velocity = endpoints.stream_publisher(TwistWithCovarianceStamped, "drift_velocity")
         self._moving = endpoints.stream_publisher(Image, "~/moving")

@@ -22,8 +22,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["corner_overlay"]
-
 # Green, in OpenCV's order of blue, green, red.
 _FOUND_BGR = (0, 220, 0)
 _REFUSED_BGR = (0, 0, 255)  # pure red

@@ -30,14 +30,11 @@ from semcal_ros.bridge.conditions import fill_conditions
 from semcal_ros.bridge.headers import fill_header, fill_stamp, optional_stamp_ns
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import published_number
-from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
+from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.errors import ConfigError, MicroscopeError
 from semcal_ros.drivers.source import JOINTS, SourceFrame
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.reporter import Reporter
-
-__all__ = ["SourceOutput"]
+from semcal_ros.nodes.common.context import NodeContext
 
 _ENCODINGS = {"uint8": "mono8", "uint16": "mono16"}
 # The moment of the acquisition that the header stamp means.
@@ -49,9 +46,7 @@ class SourceOutput:
 
     Parameters
     ----------
-    config
-        Topics, types and units.
-    endpoints, reporter
+    context
         Of the node.
     stage, magnification
         Whether these topics are published.
@@ -62,17 +57,10 @@ class SourceOutput:
         The configuration asks for something that cannot be published.
     """
 
-    def __init__(
-        self,
-        config: MicroscopeConfig,
-        endpoints: Endpoints,
-        reporter: Reporter,
-        *,
-        stage: bool,
-        magnification: bool,
-    ) -> None:
+    def __init__(self, context: NodeContext, *, stage: bool, magnification: bool) -> None:
+        config, endpoints = context.config, context.endpoints
         self._config = config
-        self._reporter = reporter
+        self._reporter = context.reporter
         if config.image.type != IMAGE_TYPE:
             raise ConfigError(
                 f"config {config.name} with images in {config.image.type}",

@@ -30,16 +30,12 @@ from semcal_ros.bridge.stage import (
     tilt_jump_rad,
 )
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
-from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware.message_types import message_class
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import value_input
-from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
-
-__all__ = ["StageInput"]
 
 # More changes than can precede a late frame.
 _KEPT = 4096
@@ -55,23 +51,15 @@ class StageInput:
 
     Parameters
     ----------
-    source
-        What the topic carries; None for no stage.
-    endpoints, reporter
-        Where to subscribe, and the counter of unusable messages.
+    context
+        Of the node; its configuration says what the topic carries, if there is one.
     group
         Callback group of the subscription.
     """
 
-    def __init__(
-        self,
-        source: StageConfig | None,
-        endpoints: Endpoints,
-        reporter: Reporter,
-        group: CallbackGroup | None = None,
-    ) -> None:
-        self._source = source
-        self._reporter = reporter
+    def __init__(self, context: NodeContext, group: CallbackGroup | None = None) -> None:
+        self._source = source = context.config.stage
+        self._reporter = context.reporter
         self._history: ZeroOrderHold[StageReading | None] = ZeroOrderHold(_KEPT)
         self._stamped = True
         self._doubt = ""
@@ -79,7 +67,7 @@ class StageInput:
         self._last: tuple[int, StageReading] | None = None
         self._jumps = 0
         if source is not None:
-            self._subscription = endpoints.subscribe(
+            self._subscription = context.endpoints.subscribe(
                 message_class(source.type), source.topic, self._on_message, value_input(), group
             )
 

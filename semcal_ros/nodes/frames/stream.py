@@ -18,8 +18,10 @@ from __future__ import annotations
 
 import math
 import os
+import struct
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -30,7 +32,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
+from semcal_ros.config.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
@@ -39,22 +41,13 @@ from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
 from semcal_ros.middleware.transport_advice import transport_advice
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
-from semcal_ros.nodes.common.qos import image_input
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.parameters import ParameterDeclaration
+from semcal_ros.nodes.common.qos import image_input, stream_output
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
 from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.frames.source_timestamps import SourceTimestamps
-
-__all__ = [
-    "FrameInput",
-    "StreamFrame",
-    "StreamNode",
-    "describe_blank_image",
-    "is_late",
-    "nominal_camera",
-]
 
 # The camera stays the same from frame to frame as long as the magnification does.
 nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)
@@ -143,49 +136,98 @@ def is_late(waited_s: float, interval_s: float) -> bool:
     return waited_s > max(_LATE_S, _LATE_INTERVALS * interval_s)
 
 
+# Number of frames: seconds of any stream, longer than another node holds a frame.
+_KEPT = 256
+# Bytes of the encapsulation; after it comes the stamp, with which std_msgs/Header and so every image begins.
+_ENCAPSULATION = 4
+_NS_PER_S = 1_000_000_000  # nanoseconds per second
+
+
+class SourceTimestamps:
+    """Publication times of original frames, by header stamp.
+
+    A magnification without a stamp is matched by the order of publication. A frame that another node made, such as
+    ``image_stabilized``, was published later than its original, perhaps after the next magnification. So this class
+    subscribes to the originals, but reads only their first bytes.
+
+    Parameters
+    ----------
+    endpoints
+        Where to subscribe.
+    source
+        The originals, whose type begins with a header; None if the frames are the originals.
+    """
+
+    def __init__(self, endpoints: Endpoints, source: ImageConfig | None) -> None:
+        self._times: OrderedDict[int, int] = OrderedDict()
+        self._originals = (
+            None
+            if source is None
+            else endpoints.subscribe(
+                message_class(source.type),
+                source.topic,
+                self._on_original,
+                stream_output(10),
+                raw=True,
+            )
+        )
+
+    def _on_original(self, serialized: bytes, info: MessageInfo) -> None:
+        order = "<" if serialized[1] & 1 else ">"
+        seconds, nanoseconds = struct.unpack_from(f"{order}iI", serialized, _ENCAPSULATION)
+        self._times[seconds * _NS_PER_S + nanoseconds] = published_ns(info)
+        while len(self._times) > _KEPT:
+            self._times.popitem(last=False)
+
+    def published_ns(self, stamp_ns: int, info: MessageInfo) -> int:
+        """Return when the original of a frame was published, ns; if it did not arrive, when the frame itself was."""
+        if self._originals is not None:
+            # The frame may be handled before originals that arrived ahead of it.
+            self._originals.take_waiting()
+        return self._times.get(stamp_ns) or published_ns(info)
+
+
 class FrameInput:
     """Subscribes to image and magnification and hands on each frame with the magnification it was taken at.
 
     Parameters
     ----------
-    config
-        Topics of images and magnifications, and what they mean.
-    parameters
-        Parameters among which is ``mixed_frames``.
-    endpoints, reporter
-        Where to subscribe, and the counters and the log.
+    context
+        Of the node; among its parameters is ``mixed_frames`` unless ``keep_mixed`` is set.
     on_frame
         Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted.
     magnification_config
-        Returns the configuration with which magnifications are read; by default ``config``.
+        Returns the configuration with which magnifications are read; by default that of the node.
     topic, databar_rows
         Topic of the images if they are derived from the microscope's, and the number of text rows at their bottom;
         by default those of the configuration, which may be to find them in the first two images.
     group
         Callback group of both subscriptions.
+    keep_mixed
+        Hand on frames that were being scanned while the magnification changed, whatever the parameter says.
     """
 
     def __init__(
         self,
-        config: MicroscopeConfig,
-        parameters: Parameters | Mapping[str, Any],
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         on_frame: Callable[[StreamFrame], None],
         *,
         magnification_config: Callable[[], MicroscopeConfig] | None = None,
         topic: str | None = None,
         databar_rows: int | None = None,
         group: CallbackGroup | None = None,
+        keep_mixed: bool = False,
     ) -> None:
+        config, endpoints = context.config, context.endpoints
         source = config.image
-        self._parameters = parameters
-        self._reporter = reporter
+        self._parameters = context.parameters
+        self._reporter = context.reporter
+        self._keep_mixed = keep_mixed
         self._on_frame = on_frame
         self._magnification_config = magnification_config or (lambda: config)
         self._databar = DatabarCutter(source.databar_rows if databar_rows is None else databar_rows)
         # Before the images, so that a late-joining node knows the magnification of its first frame.
-        self._magnification = MagnificationInput(config, endpoints, reporter, group=group)
+        self._magnification = MagnificationInput(context, group=group)
         # Images that another node of the suite derives from the microscope's are not compressed.
         kind = message_class(IMAGE_TYPE if topic else source.type)
         self._source = SourceTimestamps(endpoints, source if topic else None)
@@ -259,11 +301,14 @@ class FrameInput:
         interval_s = self._interval_s(published_ns(info), missed)
         try:
             frame = self._frame(message, info, interval_s)
-            if frame and not (frame.mixed and self._parameters[_MIXED.name] == "drop"):
+            if frame and (not frame.mixed or self._takes_mixed()):
                 self._on_frame(frame)
         except NODE_ERRORS as error:
             self._reporter.reject(error)
         self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))
+
+    def _takes_mixed(self) -> bool:
+        return self._keep_mixed or self._parameters[_MIXED.name] != "drop"
 
     def _interval_s(self, sent_ns: int, missed: int) -> float | None:
         before, self._sent_ns = self._sent_ns, sent_ns
@@ -379,9 +424,7 @@ class StreamNode(SemNode):
 
     def receive_frames(self, on_frame: Callable[[StreamFrame], None], **options: Any) -> None:
         """Start receiving frames, at the end of the constructor; ``options`` are those of :class:`FrameInput`."""
-        self.frames = FrameInput(
-            self.config, self.parameters, self.endpoints, self.reporter, on_frame, **options
-        )
+        self.frames = FrameInput(self.node_context, on_frame, **options)
 
     def known_magnification(self, frame: StreamFrame) -> float | None:
         """Return the magnification of a frame; count a frame without one."""

@@ -32,15 +32,13 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware.message_types import message_class
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, published_ns
 from semcal_ros.viewer.pictures import Outlines, outline
-
-__all__ = ["PolledGroup", "ViewedFrame", "ViewedImages"]
 
 # Raw images that wait for their corrected ones: registration takes some frames in a fast stream.
 _RAW_DEPTH = 4
@@ -121,13 +119,14 @@ class ViewedImages:
 
     Parameters
     ----------
-    config
-        Names the topic of the raw images.
-    endpoints, group
-        Where to subscribe, and a :class:`PolledGroup`.
+    context
+        Of the node.
+    group
+        Of the subscriptions.
     """
 
-    def __init__(self, config: MicroscopeConfig, endpoints: Endpoints, group: PolledGroup) -> None:
+    def __init__(self, context: NodeContext, group: PolledGroup) -> None:
+        config, endpoints = context.config, context.endpoints
         self._databar = DatabarCutter(config.image.databar_rows)
         self._raw_type = message_class(config.image.type)
         self._raw = self._subscribe(

@@ -36,12 +36,10 @@ from semcal_ros.bridge.projection import (
     stamped_projection_from_message,
 )
 from semcal_ros.core.arrays import Array
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
-from semcal_ros.nodes.common.reporter import NODE_ERRORS, Reporter
+from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo
-
-__all__ = ["ServoFrame", "ServoInput"]
 
 # Frames that wait for their other parts: more than the queues of all inputs hold. Projections: as many magnifications
 # as can be on their way with those frames.
@@ -87,8 +85,8 @@ class ServoInput:
 
     Parameters
     ----------
-    endpoints, reporter
-        Where to subscribe, and the counters.
+    context
+        Of the node.
     on_frame
         Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted and passed to ``on_error``.
     on_error
@@ -99,14 +97,14 @@ class ServoInput:
 
     def __init__(
         self,
-        endpoints: Endpoints,
-        reporter: Reporter,
+        context: NodeContext,
         on_frame: Callable[[ServoFrame], None],
         on_error: Callable[[str], None],
         *,
         with_drift: bool,
     ) -> None:
-        self._reporter = reporter
+        endpoints = context.endpoints
+        self._reporter = context.reporter
         self._on_frame = on_frame
         self._on_error = on_error
         self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}

@@ -21,8 +21,6 @@ import math
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
 from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
 
-__all__ = ["SERVO_PARAMETERS", "read_goal", "read_servo_settings"]
-
 _GOAL = (
     ParameterDeclaration(
         "goal_x_m", 0.0, "Goal of the target in the sem frame, x.", "m", -1e-3, 1e-3

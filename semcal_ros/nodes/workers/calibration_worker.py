@@ -41,16 +41,6 @@ from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildP
 from semcal_ros.workflows.calibrate import calibrate_found
 from semcal_ros.workflows.extend import extend_by_pictures
 
-__all__ = [
-    "CalibrationJob",
-    "CalibrationProcess",
-    "ExtensionJob",
-    "JobResult",
-    "Stage",
-    "serve",
-    "without_images",
-]
-
 # How often a running calibration asks whether it is still wanted: a person notices no delay at a stop.
 _POLL_S = 0.1
 # A stage is published when it changes, though not more often than can be read, and as a sign of life in between.
@@ -249,7 +239,7 @@ class CalibrationProcess:
             process = self._process = ChildProcess(serve, _NICE)
         try:
             process.send(self.job)
-            return self._result(process, still_wanted, _Progress(on_progress))
+            return self._result(process, still_wanted, _ProgressRelay(on_progress))
         except ChildProcessEnded as error:
             text = "cancelled" if self._cancelled else _describe(error, self.job.do_with_less)
             return JobResult("", text, failed=True)
@@ -260,7 +250,7 @@ class CalibrationProcess:
 
     @staticmethod
     def _result(
-        process: ChildProcess, still_wanted: Callable[[], bool], progress: _Progress
+        process: ChildProcess, still_wanted: Callable[[], bool], progress: _ProgressRelay
     ) -> JobResult:
         while still_wanted():
             progress.publish()
@@ -273,7 +263,7 @@ class CalibrationProcess:
         return JobResult("", "stopped", failed=True)
 
 
-class _Progress:
+class _ProgressRelay:
     """Forwards stages at a bounded rate; the fraction never decreases, even if work starts again."""
 
     def __init__(self, on_progress: Callable[[Stage], None]) -> None:

@@ -31,8 +31,6 @@ from operator import is_
 from types import FunctionType
 from typing import Any
 
-__all__ = ["Channel", "ChildProcess", "ChildProcessEnded"]
-
 # A fork would copy the threads' locks of rclpy and of the middleware in whatever state they are.
 _SPAWN = multiprocessing.get_context("spawn")
 # The matrices are small; more threads would only take processors away from the live nodes.

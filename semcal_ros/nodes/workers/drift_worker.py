@@ -34,8 +34,6 @@ from semcal_ros.core.drift.tracker import DriftPredictor, DriftTracker, DriftUpd
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 
-__all__ = ["DriftProcess", "Measurement", "measure_frame", "serve"]
-
 # A tenth of the weight of a live node (sched(7): each step is a factor of 1.25): the stream goes first.
 _NICE = 10
 

@@ -45,15 +45,6 @@ from semcal_ros.report.html.style import (
     style_field_axes,
 )
 
-__all__ = [
-    "compute_tilts_deg",
-    "plot_coverage",
-    "plot_reached_shares",
-    "plot_tilt_directions",
-    "plot_tilts",
-]
-
-
 # Cells across the field in the map of coverage: some 430 of them in a 4:3 image.
 _CELLS = 24
 

@@ -51,7 +51,7 @@ _FEW_CORNERS = 0.5
 
 
 @dataclass(frozen=True)
-class Mark:
+class CornerMark:
     """The residual of one corner: an SVG path, and its value as text (empty for most)."""
 
     path: str
@@ -96,7 +96,7 @@ class WorstView:
     bar: DrawnScaleBar
     dots: str
     arrows: str
-    marks: tuple[Mark, ...]
+    marks: tuple[CornerMark, ...]
     alt: str
     caption: str
 
@@ -204,7 +204,7 @@ def _describe(
         dots="".join(f"M{a:.1f} {b:.1f}h0" for a, b in xy),
         arrows="".join(_draw_arrow(xy[k], moves[k]) for k in others),
         marks=tuple(
-            Mark(
+            CornerMark(
                 _draw_arrow(xy[k], moves[k]),
                 f"{lengths[k]:.3f} px, {format_length(float(lengths[k]) * pixel_m)}",
             )

@@ -70,7 +70,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Strip:
+class ReadingArea:
     """A rectangle of an image, CSS px from its upper left corner, and what it tells."""
 
     x: float
@@ -103,7 +103,7 @@ class Picture:
     caption: str
     width: int
     height: int
-    strips: tuple[Strip, ...] = ()
+    strips: tuple[ReadingArea, ...] = ()
 
 
 def encode_data_uri(kind: str, data: bytes) -> str:
@@ -123,7 +123,7 @@ def encode_figure(
     return Picture(source, alt, caption, round(float(width)), round(float(height)), strips)
 
 
-def _place(figure: Figure, readings: Readings) -> tuple[Strip, ...]:
+def _place(figure: Figure, readings: Readings) -> tuple[ReadingArea, ...]:
     """Divide the plots into strips, one around each place."""
     scale = _CSS_PX_PER_INCH / figure.dpi
     boxes = [axes.get_window_extent() for axes in readings.axes]
@@ -140,7 +140,7 @@ def _place(figure: Figure, readings: Readings) -> tuple[Strip, ...]:
         return round(float(scale * dots), 1)
 
     return tuple(
-        Strip(to_css(first), to_css(top), to_css(last - first), to_css(high - low), text)
+        ReadingArea(to_css(first), to_css(top), to_css(last - first), to_css(high - low), text)
         for first, last, text in zip(left, right, readings.texts, strict=True)
     )
 

@@ -76,22 +76,22 @@ def test_files_are_cut_and_it_is_said(tmp_path: Path) -> None:
 
 
 def test_a_finder_waits_for_the_next_image_only_where_there_is_a_bar() -> None:
-    assert DatabarFinder().look(scanned()) == 0
+    assert DatabarFinder().find_rows(scanned()) == 0
     finder = DatabarFinder()
-    assert finder.look(with_bar(scanned(), 24, "1000x 5 kV")) is None
-    assert finder.look(with_bar(scanned(), 24, "500x 5 kV")) == 24
+    assert finder.find_rows(with_bar(scanned(), 24, "1000x 5 kV")) is None
+    assert finder.find_rows(with_bar(scanned(), 24, "500x 5 kV")) == 24
     # Decided: the beam may be blanked now.
-    assert finder.look(with_bar(np.zeros((200, 300), np.uint8), 24, "500x")) == 24
+    assert finder.find_rows(with_bar(np.zeros((200, 300), np.uint8), 24, "500x")) == 24
     # Images of another size are others.
-    assert finder.look(scanned(224, 280)) == 0
+    assert finder.find_rows(scanned(224, 280)) == 0
 
 
 def test_a_blank_image_tells_nothing() -> None:
     finder = DatabarFinder()
-    assert finder.look(np.zeros((224, 300), np.uint8)) == 0
-    assert finder.look(with_bar(np.zeros((200, 300), np.uint8), 24, "5 kV")) is None
-    assert finder.look(with_bar(scanned(), 24, "5 kV")) is None
-    assert finder.look(with_bar(scanned(), 24, "5 kV")) == 24
+    assert finder.find_rows(np.zeros((224, 300), np.uint8)) == 0
+    assert finder.find_rows(with_bar(np.zeros((200, 300), np.uint8), 24, "5 kV")) is None
+    assert finder.find_rows(with_bar(scanned(), 24, "5 kV")) is None
+    assert finder.find_rows(with_bar(scanned(), 24, "5 kV")) == 24
 
 
 def with_ground(clipped_rows: int, seed: int) -> NDArray[np.uint8]:
@@ -106,8 +106,8 @@ def with_ground(clipped_rows: int, seed: int) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("rows", [16, 30, 48])
 def test_a_dark_ground_is_no_bar(rows: int) -> None:
     finder = DatabarFinder()
-    first = finder.look(with_ground(rows, seed=0))
-    assert (finder.look(with_ground(rows, seed=1)) if first is None else first) == 0
+    first = finder.find_rows(with_ground(rows, seed=0))
+    assert (finder.find_rows(with_ground(rows, seed=1)) if first is None else first) == 0
     # A single image does suggest one: text does not stay in one image.
     assert find_databar(with_ground(rows, seed=0)) == rows
 
@@ -146,7 +146,7 @@ def test_random_bars_are_found_in_their_second_image(seed: int) -> None:
         field = rng.normal(rng.uniform(60, 180), rng.uniform(6, 30), (rows, columns))
         image = np.vstack([np.clip(np.rint(field), 0, 255).astype(np.uint8), bar])
         image = image.astype(np.uint16) * 257 if deep else image
-        seen = finder.look(np.dstack([image] * 3) if seed % 5 == 0 else image)
+        seen = finder.find_rows(np.dstack([image] * 3) if seed % 5 == 0 else image)
         assert (seen is None) is (k == 0)
     assert seen == height
 

@@ -25,9 +25,14 @@ from typing import Any
 import pytest
 from std_msgs.msg import String
 
-from semcal_ros.config.config import load_config
 from semcal_ros.nodes.frames.calibration_input import CalibrationInput, calibration_digest
-from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
+from tests.helpers.node_fakes import (
+    FakeEndpoints,
+    FakeParameters,
+    fake_context,
+    fake_reporter,
+    notes,
+)
 from tests.helpers.node_scenes import make_calibration
 
 TIMEOUT_S = 30.0
@@ -49,10 +54,7 @@ class Bench:
         self.changes: list[float] = []
         self.reporter, self.log = fake_reporter()
         self.input = CalibrationInput(
-            load_config("generic"),
-            self.parameters,
-            self.endpoints,
-            self.reporter,
+            fake_context(self.endpoints, parameters=self.parameters, reporter=self.reporter),
             on_change=lambda: self.changes.append(self.width_m),
         )
 

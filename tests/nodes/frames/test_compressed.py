@@ -29,6 +29,7 @@ from semcal_ros.bridge.compressed import image_from_compressed
 from semcal_ros.bridge.diagnostics import StreamStatistics
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.frames.compressed import CompressedOutput, compressed_parameters
+from tests.helpers.node_fakes import fake_context
 from tests.helpers.node_scenes import image_message, stamp_of, texture
 from tests.helpers.ros_process import TIMEOUT_S
 
@@ -76,9 +77,8 @@ class Stub:
         return SimpleNamespace(trigger=self.results_waiting.release)
 
     def output(self) -> CompressedOutput:
-        parameters: Any = self.parameters
-        connected: Any = self
-        return CompressedOutput(parameters, connected, connected, "image_rect")
+        context = fake_context(self, parameters=self.parameters, reporter=self)
+        return CompressedOutput(context, "image_rect")
 
     def _publish(self, message: Any) -> None:
         self.is_publishing.set()

@@ -26,7 +26,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from semcal_ros.core.camera.provenance import Provenance
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
-from tests.helpers.node_fakes import FakeEndpoints, fake_reporter, notes
+from tests.helpers.node_fakes import FakeEndpoints, fake_context, fake_reporter, notes
 from tests.helpers.node_scenes import make_calibration
 
 MADE_AT = Provenance(
@@ -47,7 +47,9 @@ class Bench:
         self.endpoints: Any = FakeEndpoints()
         self.reporter, self.log = fake_reporter()
         self.current: Any = CALIBRATION
-        self.watch = ConditionsWatch(self.endpoints, self.reporter, lambda: self.current)
+        self.watch = ConditionsWatch(
+            fake_context(self.endpoints, reporter=self.reporter), lambda: self.current
+        )
 
     def tell(self, **values: str) -> None:
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]

@@ -17,15 +17,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from sensor_msgs.msg import JointState
 
-from semcal_ros.config.config import StageConfig
+from semcal_ros.config.config import MicroscopeConfig, StageConfig, load_config
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.nodes.frames.stage import StageInput
-from tests.helpers.node_fakes import FakeEndpoints, fake_reporter, notes
+from tests.helpers.node_fakes import FakeEndpoints, fake_context, fake_reporter, notes
 
 S = 1_000_000_000
 
@@ -36,13 +37,19 @@ def joints(stamp_s: int, **positions: float) -> JointState:
     return message
 
 
+def config_with(stage: StageConfig | None) -> MicroscopeConfig:
+    return replace(load_config("generic"), stage=stage)
+
+
 class Bench:
     """A stage input, and messages for it that are published at a given time."""
 
     def __init__(self, source: StageConfig | None = None) -> None:
         self.endpoints: Any = FakeEndpoints()
         self.reporter, self.log = fake_reporter()
-        self.input = StageInput(source or StageConfig(), self.endpoints, self.reporter)
+        self.input = StageInput(
+            fake_context(self.endpoints, config_with(source or StageConfig()), None, self.reporter)
+        )
 
     def publish(self, message: JointState, sent_s: int = 100) -> None:
         info = {"source_timestamp": sent_s * S, "received_timestamp": sent_s * S}
@@ -158,7 +165,7 @@ def test_degrees_leave_a_doubt_until_it_is_taken_back() -> None:
 
 def test_without_a_section_nothing_is_subscribed() -> None:
     endpoints: Any = FakeEndpoints()
-    stage = StageInput(None, endpoints, fake_reporter()[0])
+    stage = StageInput(fake_context(endpoints, config_with(None)))
     assert stage.conditions() == []
     assert stage.at(S) is None
     assert endpoints.subscriptions == {}

@@ -37,7 +37,13 @@ from semcal_ros.nodes.frames.stream import (
     is_late,
 )
 from tests.files.images.test_databar import scanned, with_bar
-from tests.helpers.node_fakes import FakeEndpoints, FakeParameters, fake_reporter, notes
+from tests.helpers.node_fakes import (
+    FakeEndpoints,
+    FakeParameters,
+    fake_context,
+    fake_reporter,
+    notes,
+)
 from tests.helpers.node_scenes import image_message, magnification_message, texture
 
 IMAGE = texture(size=32)
@@ -75,17 +81,13 @@ class Bench:
         self.reporter, self.log = fake_reporter()
         self.frames: list[StreamFrame] = []
         config = load_config("virtual_sem")
-        self.input = FrameInput(
-            replace(
-                config,
-                scan=ScanTiming(0.1, bidirectional=bidirectional),
-                image=ImageConfig(databar_rows=databar_rows),
-            ),
-            parameters,
-            self.endpoints,
-            self.reporter,
-            self.frames.append,
+        config = replace(
+            config,
+            scan=ScanTiming(0.1, bidirectional=bidirectional),
+            image=ImageConfig(databar_rows=databar_rows),
         )
+        context = fake_context(self.endpoints, config, parameters, self.reporter)
+        self.input = FrameInput(context, self.frames.append)
 
     @property
     def images(self) -> Any:

@@ -24,11 +24,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
-from semcal_ros.config.config import load_config
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription
 from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedImages
-from tests.helpers.node_fakes import FakeEndpoints
+from tests.helpers.node_fakes import FakeEndpoints, fake_context
 from tests.helpers.node_scenes import image_message
 from tests.helpers.ros_process import Peer
 
@@ -92,7 +91,7 @@ def test_a_publisher_that_offers_less_is_heard_once_events_are_open(peer: Peer) 
 
 def test_what_moves_by_itself_is_outlined_in_the_corrected_picture() -> None:
     endpoints: Any = FakeEndpoints()
-    images = ViewedImages(load_config("virtual_sem"), endpoints, PolledGroup())
+    images = ViewedImages(fake_context(endpoints, "virtual_sem"), PolledGroup())
     mask = np.zeros((32, 32), np.uint8)
     mask[8:16, 4:20] = 255
     info = {"source_timestamp": 1, "received_timestamp": 1}

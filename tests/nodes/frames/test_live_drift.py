@@ -1,0 +1,123 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What drift does to a frame on its way through a node, without ROS at work."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semcal_ros.config.config import load_config
+from semcal_ros.nodes.common.parameters import INTERPOLATION
+from semcal_ros.nodes.frames.compressed import compressed_parameters
+from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, DriftCorrection, FrameDrift
+from semcal_ros.nodes.frames.outputs import ImageOutput
+from semcal_ros.nodes.frames.stream import StreamFrame, nominal_camera
+from tests.helpers.node_fakes import FakeParameters, fake_context
+from tests.helpers.node_scenes import image_message, texture
+
+CONFIG = replace(load_config("virtual_sem"), scan=None)
+IMAGE = texture(size=128)
+CAMERA = nominal_camera(5000.0, 128, 128, CONFIG.display_width_m)
+S = 1_000_000_000
+
+
+class Bench:
+    """A correction with an output of images, and what both publish, in this order."""
+
+    def __init__(self, closing: ExitStack) -> None:
+        self.published: list[tuple[str, Any]] = []
+        endpoints: Any = SimpleNamespace(
+            stream_publisher=self._publisher,
+            trigger_service=lambda *_: None,
+            below=lambda topic, name: f"{topic}/{name}",
+            guard=lambda _callback: SimpleNamespace(trigger=lambda: None),
+        )
+        declared = (*DRIFT_PARAMETERS, INTERPOLATION, *compressed_parameters("image_stabilized"))
+        parameters = FakeParameters({one.name: one.default for one in declared})
+        parameters.set("drift_tracking", "every_frame")
+        context = fake_context(endpoints, CONFIG, parameters)
+        self.image = ImageOutput(context, "image_stabilized")
+        closing.callback(self.image.close)
+        self.correction = DriftCorrection(context, closing)
+        self.drifts: list[FrameDrift | None] = []
+
+    def _publisher(self, _kind: Any, topic: str, _name: str = "") -> Any:
+        return SimpleNamespace(
+            is_awaited=topic != "image_stabilized/compressed",
+            publish=lambda message: self.published.append((topic, message)),
+        )
+
+    def receive(self, image: np.ndarray, second: int, *, mixed: bool = False) -> list[str]:
+        """Take a frame; the topics on which something was published, in order."""
+        self.published.clear()
+        header = image_message(image, float(second)).header
+        frame = StreamFrame(image, "mono8", header, second * S, 5000.0, mixed)
+
+        def publish(drift: FrameDrift | None) -> None:
+            self.drifts.append(drift)
+            self.image.publish(frame)
+
+        self.correction.correct(frame, CAMERA, self.image, publish)
+        return [topic for topic, _ in self.published]
+
+
+@pytest.fixture
+def bench() -> Any:
+    with ExitStack() as closing:
+        yield Bench(closing)
+
+
+def test_the_image_comes_before_its_drift(bench: Bench) -> None:
+    topics = ["image_stabilized", "drift", "drift_velocity", "~/moving"]
+    assert bench.receive(IMAGE, 1) == topics
+    assert bench.correction.conditions() == []
+
+
+def test_a_shift_is_taken_out_of_the_image(bench: Bench) -> None:
+    for second in range(1, 4):
+        bench.receive(IMAGE, second)
+    # Content that moves to the right by four pixels; the border that came in is not compared.
+    bench.receive(np.roll(IMAGE, 4, axis=1), 4)
+    drift = bench.drifts[-1]
+    assert drift is not None
+    dx_px = float(CAMERA.ideal_from_sem_jacobian[0] @ drift.estimate.drift_m)
+    # What wraps around at the border is not the specimen: a tenth of a pixel of the four.
+    assert dx_px == pytest.approx(4.0, abs=0.1)
+    inside = np.s_[16:-16, 16:-16]
+    difference = bench.image.pixels[inside].astype(float) - IMAGE[inside]
+    # A tenth of a pixel on a texture of this contrast; unshifted, they would differ by more than ten times this.
+    assert np.sqrt(np.mean(np.square(difference))) < 0.1 * IMAGE.std()
+
+
+def test_a_frame_of_two_magnifications_has_no_drift(bench: Bench) -> None:
+    bench.receive(IMAGE, 1)
+    assert bench.receive(IMAGE, 2, mixed=True) == ["image_stabilized"]
+    assert bench.drifts[-1] is None
+    np.testing.assert_array_equal(bench.image.pixels, IMAGE)
+
+
+def test_a_reset_begins_at_zero(bench: Bench) -> None:
+    bench.receive(IMAGE, 1)
+    bench.correction.tracking.reset()
+    bench.receive(np.roll(IMAGE, 4, axis=1), 2)
+    drift = bench.drifts[-1]
+    assert drift is not None
+    np.testing.assert_array_equal(drift.estimate.drift_m, 0.0)
