@@ -222,13 +222,9 @@ def test_the_slider_tells_the_kinds_of_distortion_where_there_are_further_terms(
     result: CalibrationResult,
 ) -> None:
     name = "Largest of each kind"
-    plain = replace(
-        result.model,
-        functions={k: result.model.functions[k] for k in FUNCTION_NAMES},
-        residual=None,
-    )
-    size = sum(function.size for function in plain.functions.values())
-    plain = replace(plain, covariance=1e-12 * np.eye(size))
+    functions = {k: result.model.functions[k] for k in FUNCTION_NAMES}
+    covariance = 1e-12 * np.eye(sum(function.size for function in functions.values()))
+    plain = replace(result.model, functions=functions, residual=None, covariance=covariance)
     assert all(name not in dict(row["values"]) for row in tabulate_cameras(plain))
     for row in tabulate_cameras(_with_spiral(plain)):
         told = dict(row["values"])[name]
