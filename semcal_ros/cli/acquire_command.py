@@ -34,7 +34,7 @@ from semcal_ros.cli.options import (
     require_folder,
 )
 from semcal_ros.config.config import load_config
-from semcal_ros.core.calibration.acquisition import MOST_VIEWS
+from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.ladder.plan import plan_ladder
 
@@ -117,7 +117,7 @@ def _wait_for_enter(text: str) -> None:
 @click.option(
     "--most-views",
     type=click.IntRange(6, 1000),
-    default=MOST_VIEWS,
+    default=VIEWS_MAX,
     show_default=True,
     help="End after so many views, with the target met or not.",
 )

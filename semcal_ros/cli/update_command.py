@@ -26,7 +26,7 @@ from semcal_ros.cli.options import PATH, output_option, parse_ratio
 from semcal_ros.cli.output import echo_notes, echo_rejected, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
+from semcal_ros.core.calibration.judgement.thresholds import DEFAULT_AGEING
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import update
 

@@ -57,19 +57,19 @@ from semcal_ros.core.calibration.estimator.variance_components import (
     limit_components,
     update_components,
 )
+from semcal_ros.core.calibration.judgement.thresholds import NAMED_MAX
 from semcal_ros.core.calibration.select import Selection, select_and_adjust
 from semcal_ros.core.calibration.start import with_excess
+from semcal_ros.core.calibration.thresholds import (
+    EXACT_STEPS_MAX,
+    EXACT_TOLERANCE,
+    SPREAD_CHANGE,
+    SPREAD_UPDATES_MAX,
+)
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = ["JointFit", "solve", "without_magnification"]
-
-# Updates of the variance components at most, until they change by less than the last number.
-_LAST_UPDATES, _SMALL_CHANGE = 30, 0.005
-# Of the last adjustment: what is left of a step is some hundredths of a sigma then, however many corners there are.
-_EXACT, _MOST_ITERATIONS = 1e-10, 300
-# Views that a message names.
-_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ def _refuse_lost_corners(setup: Setup, adjustment: Adjustment) -> None:
     if not np.any(lost):
         return
     views = sorted({int(v) for v in adjustment.problem.view_of_point[lost]})
-    more = f" and {len(views) - _NAMED} more" if len(views) > _NAMED else ""
+    more = f" and {len(views) - NAMED_MAX} more" if len(views) > NAMED_MAX else ""
     raise UnusableCalibrationError(
         "an adjustment whose camera cannot show corners of "
-        f"{', '.join(setup.views[v].name for v in views[:_NAMED])}{more}",
+        f"{', '.join(setup.views[v].name for v in views[:NAMED_MAX])}{more}",
         expected="views of one flat grid, by one microscope, at the magnifications that are stated",
         do="leave these views out, or check magnifications, --display-width and --squares",
     )
@@ -130,15 +130,15 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     spread = update_components(setup, adjustment.problem, adjustment.result)
     spread = limit_components(setup, spread)
     state, _ = try_other_poses(setup, functions, spread, adjustment.result.state)
-    for _ in range(_LAST_UPDATES):
+    for _ in range(SPREAD_UPDATES_MAX):
         problem = build_problem(setup, functions, setup.views, spread)
         result = right_way_up(setup, functions, problem, refine_coarsely(problem, state))
         before, state = spread, result.state
         spread = update_components(setup, problem, result)
-        if _largest_change(before, spread) < _SMALL_CHANGE:
+        if _largest_change(before, spread) < SPREAD_CHANGE:
             break
     problem = build_problem(setup, functions, setup.views, spread)
-    result = refine(problem, state, tolerance=_EXACT, max_iterations=_MOST_ITERATIONS)
+    result = refine(problem, state, tolerance=EXACT_TOLERANCE, max_iterations=EXACT_STEPS_MAX)
     functions = with_coefficients(functions, result.state.theta)
     return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
 

@@ -32,7 +32,6 @@ from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Mask
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import SMOOTH, refit_functions
 from semcal_ros.core.calibration.estimator.poses import (
-    COARSE,
     adjust,
     initial_values,
     refine_coarsely,
@@ -51,6 +50,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     stack_theta,
     with_coefficients,
 )
+from semcal_ros.core.calibration.estimator.thresholds import COARSE_TOLERANCE
 from semcal_ros.core.calibration.estimator.variance_components import update_components
 from semcal_ros.core.calibration.stage import OFFSET_NAMES, Attitudes, attitudes, stage_rotations
 from semcal_ros.core.calibration.views import GridView, add_excess_noise
@@ -392,7 +392,7 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     functions = refit_functions(functions, dict.fromkeys(SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
-    result = adjust(problem, state, tolerance=COARSE)
+    result = adjust(problem, state, tolerance=COARSE_TOLERANCE)
     result = right_way_up(setup, functions, problem, result)
     for _ in range(_FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the

@@ -53,13 +53,8 @@ from semcal_ros.core.calibration.estimator.residuals import (
     view_residuals,
     whitened_norm,
 )
-from semcal_ros.core.calibration.estimator.trust_region import (
-    FIRST_DAMPING,
-    MIN_DAMPING,
-    DescentStatus,
-    Step,
-    descend,
-)
+from semcal_ros.core.calibration.estimator.thresholds import DAMPING_MIN, FIRST_DAMPING
+from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, Step, descend
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
@@ -325,7 +320,7 @@ def _refine_poses(
         decrease = np.where(better, costs - trial_costs, 0.0)
         state = pick_views(better, trial, state)
         costs = np.where(better, trial_costs, costs)
-        damping = np.where(better, np.maximum(0.1 * damping, MIN_DAMPING), 10.0 * damping)
+        damping = np.where(better, np.maximum(0.1 * damping, DAMPING_MIN), 10.0 * damping)
         predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, own], change)
         small = tolerance * (1.0 + costs)
         if np.all(np.where(better, decrease, predicted) <= small):
