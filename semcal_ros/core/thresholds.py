@@ -37,6 +37,8 @@ V = TypeVar(
     "V",
     int,
     float,
+    tuple[int, int],
+    tuple[float, float],
     tuple[int, ...],
     tuple[float, ...],
     tuple[tuple[float, float], ...],

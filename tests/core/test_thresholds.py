@@ -41,7 +41,6 @@ NOT_YET = {
     "core/registration",
     "core/calibration",
     "core/calibration/estimator",
-    "applications/cantilever",
     "applications/reconstruction",
     "applications/servoing",
 }
