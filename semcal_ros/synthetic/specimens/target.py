@@ -23,14 +23,15 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from semcal_ros.applications.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
+from semcal_ros.applications.servoing.target import CELLS, NestedTarget
+from semcal_ros.applications.servoing.thresholds import MARKER_BITS, MARKER_SIDE, RATIO
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.cantilever import NO_CHARGING, Charging
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
 
 # Texels per cell: seven for each square of a marker, and nine for the white on either side.
 _TEXELS_PER_BIT = 7
-_CELL = round(MARKER_BITS * _TEXELS_PER_BIT / SIDE)
+_CELL = round(MARKER_BITS * _TEXELS_PER_BIT / MARKER_SIDE)
 
 
 @dataclass(frozen=True)
