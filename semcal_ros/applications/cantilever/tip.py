@@ -24,7 +24,7 @@ are averaged, each as likely as it fits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -41,9 +41,9 @@ from semcal_ros.applications.cantilever.thresholds import (
     FLANK_MAX,
     LOSS_MAX,
     MIDDLE_PART,
-    RIM_PX,
     ROUGH_APEX_PX,
     SETTLED_PX,
+    SHORT_REACH,
     STRAIGHT_MIN_PX,
     STRAIGHT_PART,
     TIP_BLOCK_MIN_PX,
@@ -205,9 +205,24 @@ def fit_tip(samples: PixelSamples, rough_m: float, model: EdgeModel, px_m: float
     apexes, sigmas = np.array([fit[0].apex for fit in fits]), np.array([fit[1] for fit in fits])
     apex = float(likely @ apexes)
     spread = likely @ (sigmas**2 + (apexes - apex) ** 2)
-    sigma = float(np.sqrt(spread + (RIM_PX * px_m) ** 2))
     best = fits[int(np.argmax(likely))][0]
+    sigma = float(np.hypot(np.sqrt(spread), _find_reach_error(samples, best, model, px_m)))
     return TipFit(apex, sigma, best.length, 2.0 * best.facet, best.flank)
+
+
+def _find_reach_error(
+    samples: PixelSamples, outline: _Outline, model: EdgeModel, px_m: float
+) -> float:
+    """Find the 1-sigma of what a bright rim or a halo, which the model of an edge lacks, moves the apex by.
+
+    It pulls an edge by the more, the farther the fit reaches; from the apex with a shorter reach, the one with none
+    is extrapolated.
+    """
+    shorter = replace(model, reach_m=SHORT_REACH * model.reach_m)
+    again = _refine(samples, outline, shorter, px_m)
+    if again is None:
+        return model.width_m
+    return abs(again[0].apex - outline.apex) / (1.0 - SHORT_REACH)
 
 
 def _start_outlines(
