@@ -34,15 +34,13 @@ TABLES = sorted(path for floor in FLOORS for path in (PACKAGE / floor).rglob("*/
 ROOMS = [path.parent for path in TABLES]
 # A room with no more numbers than these may keep each beside its use.
 FEW = 4
-# Geometry, and nothing that could be otherwise: from a cell to its four neighbours; the unit matrix.
-NO_THRESHOLDS = {"STEPS", "_IDENTITY"}
+# Geometry and indices, nothing that could be otherwise: from a cell to its four neighbours; the unit matrix.
+NO_THRESHOLDS = {"STEPS", "_IDENTITY", "_MIRROR", "_PAIRS", "_SCALE"}
 NOT_YET = {
     "core/drift",
     "core/registration",
     "core/calibration",
     "core/calibration/estimator",
-    "applications/reconstruction",
-    "applications/servoing",
 }
 house = load_script("house")
 
