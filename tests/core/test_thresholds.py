@@ -29,9 +29,10 @@ from semcal_ros.core.thresholds import Source, Table
 from tests.helpers.project import ROOT, load_script
 
 PACKAGE = ROOT / "semcal_ros"
-FLOORS = ("core", "applications")
-TABLES = sorted(path for floor in FLOORS for path in (PACKAGE / floor).rglob("*/thresholds.py"))
-ROOMS = [path.parent for path in TABLES]
+FLOORS = ("core", "applications", "synthetic")
+TABLES = sorted(path for floor in FLOORS for path in (PACKAGE / floor).rglob("thresholds.py"))
+# That of core is what a table is.
+ROOMS = [path.parent for path in TABLES if path.parent != PACKAGE / "core"]
 # A room with no more numbers than these may keep each beside its use.
 FEW = 4
 # Geometry and indices, nothing that could be otherwise: from a cell to its four neighbours; the unit matrix.
