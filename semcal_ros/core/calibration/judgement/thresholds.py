@@ -43,9 +43,11 @@ CELL_VIEWS_MIN = TABLE.stated(
     "CELL_VIEWS_MIN", 6, "views",
     "In which a cell is seen; fewer do not tell a pattern from the scatter of the views.",
 )
-MISFIT_SIGMA = TABLE.stated(
+MISFIT_SIGMA = TABLE.measured(
     "MISFIT_SIGMA", 0.1, "of the sigma",
-    "1-sigma of the stated uncertainty of corners.",
+    "1-sigma of the stated uncertainty of corners: the error over it was 0.87 to 1.07 in six frames, tilted or not, "
+    "from 100x to 5000x, on 26 November 2026.",
+    command="python -m benchmarks.calibration --quick",
 )
 OTHER_SCALE = TABLE.stated(
     "OTHER_SCALE", 0.1, "of the scale",
