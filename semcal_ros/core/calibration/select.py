@@ -238,7 +238,7 @@ def select_functions(
     costs less. One of ``terms`` may have none, and needs more of a gain for the first. The ``current``
     choice stays unless another one is clearly better.
     """
-    candidates = _Candidates(summary, setup, functions, terms)
+    candidates = _Candidates(summary, setup, functions, (*free, *terms))
     # Each magnification is predicted from the others. Two are only fitted, by a straight line.
     known = len(setup.magnifications)
     most = known if known == 2 else known - 1
@@ -347,6 +347,7 @@ def select_and_adjust(
     spread: VarianceComponents,
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
+    always: Sequence[str] = SMOOTH,
     choose_terms: bool = True,
 ) -> Adjustment:
     """Choose the number of coefficients of every function, and further terms of the camera, until the choice no longer
@@ -358,13 +359,15 @@ def select_and_adjust(
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
-    terms = () if setup.priors.is_wide or not choose_terms else TERM_NAMES
+    terms: tuple[str, ...] = ()
+    if choose_terms and not setup.priors.is_wide:
+        terms = tuple(name for name in TERM_NAMES if name not in always)
     while rounds < _MAX_ROUNDS and not converged:
         rounds += 1
-        every = build_problem(setup, functions, setup.views, spread, candidates=terms)
+        every = build_problem(setup, functions, setup.views, spread, candidates=(*always, *terms))
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
         kept = None if setup.tempering == 1.0 and rounds <= _FREE_ROUNDS else sizes
-        chosen = select_functions(summary, setup, functions, SMOOTH, terms, kept)
+        chosen = select_functions(summary, setup, functions, always, terms, kept)
         if chosen == sizes:
             result, count = adjust_with_other_poses(setup, functions, spread, problem, result.state)
             converged = count == 0

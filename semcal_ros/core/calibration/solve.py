@@ -22,10 +22,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
-from semcal_ros.core.calibration.estimator.bundle_adjustment import Adjustment, refine
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    SMOOTH_AT_LAST,
+    Adjustment,
+    refine,
+)
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import (
-    refine_coarsely,
     right_way_up,
     try_other_poses,
 )
@@ -53,7 +56,10 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     solve_field,
     undo_field,
 )
+from semcal_ros.core.calibration.estimator.thresholds import COARSE_TOLERANCE, DAMPING_MIN
 from semcal_ros.core.calibration.estimator.variance_components import (
+    accelerate_components,
+    largest_change,
     limit_components,
     update_components,
 )
@@ -130,33 +136,27 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     spread = update_components(setup, adjustment.problem, adjustment.result)
     spread = limit_components(setup, spread)
     state, _ = try_other_poses(setup, functions, spread, adjustment.result.state)
-    for _ in range(SPREAD_UPDATES_MAX):
+    updates: list[tuple[VarianceComponents, VarianceComponents]] = []
+    while len(updates) < SPREAD_UPDATES_MAX:
         problem = build_problem(setup, functions, setup.views, spread)
-        result = right_way_up(setup, functions, problem, refine_coarsely(problem, state))
-        before, state = spread, result.state
-        spread = update_components(setup, problem, result)
-        if _largest_change(before, spread) < SPREAD_CHANGE:
+        result = refine(problem, state, tolerance=COARSE_TOLERANCE, first_damping=DAMPING_MIN)
+        result = right_way_up(setup, functions, problem, result)
+        state = result.state
+        updates.append((spread, update_components(setup, problem, result)))
+        if largest_change(*updates[-1]) < SPREAD_CHANGE:
             break
+        spread = accelerate_components(updates)
     problem = build_problem(setup, functions, setup.views, spread)
-    result = refine(problem, state, tolerance=EXACT_TOLERANCE, max_iterations=EXACT_STEPS_MAX)
+    result = refine(
+        problem,
+        state,
+        tolerance=EXACT_TOLERANCE,
+        predicted=EXACT_TOLERANCE,
+        first_damping=DAMPING_MIN,
+        max_iterations=EXACT_STEPS_MAX,
+    )
     functions = with_coefficients(functions, result.state.theta)
     return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)
-
-
-def _largest_change(before: VarianceComponents, after: VarianceComponents) -> float:
-    """Return the largest relative change of the variance components."""
-    a, b = (
-        np.concatenate(
-            [
-                [c.scale.sigma, c.visit_height.sigma],
-                c.height_sigma_m,
-                c.drift_sigma_px,
-                () if c.lattice_sigma is None else c.lattice_sigma,
-            ]
-        )
-        for c in (before, after)
-    )
-    return float(np.max(np.abs(np.log(b / a))))
 
 
 def without_magnification(fit: JointFit, index: int) -> tuple[Functions, ResidualField | None]:
@@ -195,7 +195,12 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     # The corners are believed to their own noise now.
     spread = update_components(final, adjustment.problem, adjustment.result)
     adjustment = select_and_adjust(
-        final, adjustment.functions, adjustment.result.state, spread, choose_terms=field is None
+        final,
+        adjustment.functions,
+        adjustment.result.state,
+        spread,
+        always=SMOOTH_AT_LAST,
+        choose_terms=field is None,
     )
     adjustment = _adjust_exactly(final, adjustment)
     _refuse_lost_corners(final, adjustment)

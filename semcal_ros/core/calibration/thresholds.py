@@ -157,17 +157,17 @@ APART_RAD = TABLE.stated(
 # The last fit, in solve.py
 
 SPREAD_UPDATES_MAX = TABLE.cost(
-    "SPREAD_UPDATES_MAX", 30, "updates",
+    "SPREAD_UPDATES_MAX", 40, "updates",
     "Of the variance components, until they change by less than SPREAD_CHANGE.",
 )
-SPREAD_CHANGE = TABLE.derived(
-    "SPREAD_CHANGE", 0.005, "of a spread",
-    "A small change: a spread of 100 effects is itself known to 7 %, 1 / sqrt(2 x 100).",
+SPREAD_CHANGE = TABLE.stated(
+    "SPREAD_CHANGE", 1e-6, "of a spread",
+    "A mirrored recording then gives the mirrored camera to a millionth of a sigma.",
 )
 EXACT_TOLERANCE = TABLE.stated(
-    "EXACT_TOLERANCE", 1e-10, "of the cost",
-    "Tolerance of the last fit. What is left of a step was seen to be some hundredths of a sigma then, however many "
-    "corners there are.",
+    "EXACT_TOLERANCE", 1e-10, "of the cost, half chi-squares",
+    "Of the last fit. It starts undamped: a damped first step along what is hardly determined is so short that it "
+    "would pass for the last.",
 )
 EXACT_STEPS_MAX = TABLE.cost(
     "EXACT_STEPS_MAX", 300, "steps",

@@ -132,8 +132,8 @@ def test_what_is_mirrored_in_the_reference_plane_is_seen_at_the_same_places_and_
 def test_a_pose_in_an_optimum_of_its_own_is_found_again(setup: Setup, fit: JointFit) -> None:
     own = fit.adjustment
     rotations = own.result.state.rotations.copy()
-    # A quarter turn about the normal: no tilt brings it back.
-    rotations[3] = rotations[3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    # Half a turn about the normal: no small step brings it back.
+    rotations[3] = rotations[3] @ np.diag([-1.0, -1.0, 1.0])
     lost = replace(own.result.state, rotations=rotations)
     found, changed = restart_poses(setup, own.problem, lost)
     assert changed >= 1
@@ -180,4 +180,5 @@ def test_magnifications_that_agree_make_the_prior_of_changes_about_half_as_wide(
         assert own[0] == 1.0
         if name in ("aspect", "xi_r", "xi_t"):
             # Two coefficients are determined at the most, and the usual size counts as a half.
-            assert np.all(own[1:] == own[1]) and np.sqrt(0.5 / 2.5) - 1e-6 <= own[1] < 0.8
+            np.testing.assert_allclose(own[1:], own[1], rtol=1e-12)
+            assert np.sqrt(0.5 / 2.5) - 1e-6 <= own[1] < 0.8

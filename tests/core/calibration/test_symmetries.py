@@ -106,13 +106,10 @@ def test_the_numbers_of_the_lattice_do_not_matter(
     ("turn", "most_sigmas"),
     [
         pytest.param(HALF_TURN, 1e-6, id="half a turn"),
-        # A picture that is mirrored, or turned by a quarter, has its decentring along the other diagonal. The one of
-        # the paper always has a coefficient, the other has to be asked for, so that the mirrored calibration has one
-        # unknown more: 0.07 sigma here.
-        pytest.param(MIRRORED_X, 0.15, id="mirrored along the lines", marks=pytest.mark.long),
-        pytest.param(MIRRORED_Y, 0.15, id="mirrored across the lines"),
-        # Besides, drift within an image comes with the time of the lines: it is another one after a quarter turn.
-        pytest.param(QUARTER_TURN, 0.15, id="a quarter turn", marks=pytest.mark.long),
+        pytest.param(MIRRORED_X, 1e-6, id="mirrored along the lines", marks=pytest.mark.long),
+        pytest.param(MIRRORED_Y, 1e-6, id="mirrored across the lines"),
+        # Drift within an image comes with the time of the lines: it is another one after a quarter turn.
+        pytest.param(QUARTER_TURN, 0.02, id="a quarter turn", marks=pytest.mark.long),
     ],
 )
 def test_turned_and_mirrored_views_give_the_same_camera(

@@ -93,8 +93,9 @@ def test_without_ageing_only_what_has_changed_moves(calibrated: CalibrationResul
     for g in EVERYWHERE:
         before, after = calibrated.model.at(g), done.model.at(g)
         sigma = np.sqrt(np.diag(before.covariance))
-        moved = np.abs(np.subtract(after.parameters, before.parameters)) / sigma
-        assert np.max(np.delete(moved, 1)) < 3.0
+        moved = np.abs(np.subtract(after.parameters, before.parameters))
+        # A term that the camera does not have has neither a value nor a sigma.
+        assert np.all(np.delete(moved <= 3.0 * sigma, 1))
         error = after.aspect - changed(aspect=0.002)(g).aspect
         assert abs(error) < 3.0 * np.sqrt(after.covariance[1, 1])
         # New views make nothing less certain.

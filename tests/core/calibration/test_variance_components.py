@@ -22,7 +22,12 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.variance_components import _drift_sigma
+from semcal_ros.core.calibration.estimator.problem import Spread, VarianceComponents
+from semcal_ros.core.calibration.estimator.variance_components import (
+    _drift_sigma,
+    accelerate_components,
+    largest_change,
+)
 
 USUAL_PX = 0.1
 VISITS = np.repeat([0, 1, 2], 5)
@@ -78,3 +83,32 @@ def test_drifts_that_differ_have_the_spread_of_their_differences() -> None:
             sigma = estimated(own + common, sigma)
         # Fifteen views with two drifts each, of which three visits keep one: 24 degrees of freedom, 15 %.
         assert sigma == pytest.approx(0.7, rel=0.45)
+
+
+def components(logarithms: Array) -> VarianceComponents:
+    sigmas = np.exp(logarithms)
+    spreads = (Spread(float(s), 1.0) for s in sigmas[:2])
+    return VarianceComponents(*spreads, sigmas[2:5], sigmas[5:8], sigmas[8:])
+
+
+def test_extrapolated_updates_reach_the_fixed_point_of_a_linear_map() -> None:
+    """Three rates in ten spreads: with three differences the extrapolation is exact."""
+    rng = np.random.default_rng(0)
+    fixed, directions = rng.normal(0.0, 0.1, 10), rng.normal(size=(10, 3)) * 0.02
+    moved = np.array([0.5, 0.62, 0.8])
+    updates, part = [], np.ones(3)
+    start = components(fixed + directions @ part)
+    for _ in range(4):
+        before = components(fixed + directions @ part)
+        part = moved * part
+        updates.append((before, components(fixed + directions @ part)))
+    assert largest_change(start, components(fixed)) > 0.01
+    assert largest_change(updates[-1][1], components(fixed)) > 1e-3
+    assert largest_change(accelerate_components(updates), components(fixed)) < 1e-9
+
+
+def test_updates_that_lead_far_away_are_not_extrapolated() -> None:
+    first, second, third = (components(np.full(10, x)) for x in (0.0, 1.0, 1.99))
+    assert largest_change(accelerate_components([(first, second), (second, third)]), third) == 0.0
+    # Nor is a single one.
+    assert largest_change(accelerate_components([(first, second)]), second) == 0.0

@@ -32,7 +32,7 @@ from scipy.optimize import nnls
 from semcal_ros.core.arrays import Array, Indices, equilibrate, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
-    SMOOTH,
+    SMOOTH_AT_LAST,
     Adjustment,
     BundleResult,
     refine,
@@ -320,7 +320,9 @@ def pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
     """Return the functions with a few more coefficients than were chosen, all zero."""
     out = dict(functions)
     low, high = functions["scale"].g_range
-    for name in SMOOTH if low < high else ():
+    for name in SMOOTH_AT_LAST if low < high else ():
+        if name not in functions:
+            continue
         own = functions[name]
         size = max(own.smooth_size + _RESERVE, _LEAST_SIZE)
         smooth, jumps = np.split(own.coefficients, [own.smooth_size])
@@ -361,7 +363,7 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
         for name in names_of(padded):
             own = slice(start + 1, start + padded[name].smooth_size)
             start += padded[name].size
-            if name not in SMOOTH or own.stop == own.start:
+            if name not in SMOOTH_AT_LAST or own.stop == own.start:
                 continue
             usual = problem.prior_sigma[own]
             square = float(np.sum((freed[own] / usual) ** 2))

@@ -87,6 +87,7 @@ def descend(
     *,
     max_iterations: int,
     tolerance: float,
+    predicted: float | None = None,
     first_damping: float = FIRST_DAMPING,
 ) -> Descent[S]:
     """Lower the cost step by step.
@@ -101,6 +102,8 @@ def descend(
     max_iterations, tolerance
         The descent ends at this number of steps, or when a step lowers the cost by less than this part of it and
         predicts little more.
+    predicted
+        What the last step may predict, in units of the cost; by default in proportion to ``tolerance`` and the cost.
     first_damping
         Of the first step; less than the default is for problems that are nearly linear from the start.
     """
@@ -119,6 +122,7 @@ def descend(
         damping = max(0.1 * damping, DAMPING_MIN)
         relative = decrease / max(cost, np.finfo(np.float64).tiny)
         small = decrease <= tolerance * cost
-        if small and step.predicted <= PREDICTED_MAX * tolerance * (1.0 + cost):
+        little = PREDICTED_MAX * tolerance * (1.0 + cost) if predicted is None else predicted
+        if small and step.predicted <= little:
             return Descent(state, cost, iteration, DescentStatus.SMALL_DECREASE, relative)
     return Descent(state, cost, max_iterations, DescentStatus.ITERATION_LIMIT, relative)

@@ -24,6 +24,7 @@ so that a spread which the views do not determine stays at its usual value.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,11 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     USUAL_WEIGHT,
 )
 
-__all__ = ["limit_components", "update_components"]
+__all__ = ["accelerate_components", "largest_change", "limit_components", "update_components"]
+
+# Updates from which the next one is extrapolated, and the largest extrapolation of the logarithm of a spread: from
+# farther away the updates are not linear.
+_MEMORY, _FARTHEST = 4, 0.5
 
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
@@ -96,6 +101,49 @@ def limit_components(setup: Setup, found: VarianceComponents) -> VarianceCompone
         visit_height=least(found.visit_height, usual.visit_height),
         drift_sigma_px=np.minimum(found.drift_sigma_px, usual.drift_sigma_px),
         lattice_sigma=lattice,
+    )
+
+
+def accelerate_components(
+    updates: Sequence[tuple[VarianceComponents, VarianceComponents]],
+) -> VarianceComponents:
+    """Return spreads nearer to the fixed point than those after the last of some updates (before, after).
+
+    Anderson's extrapolation (1965, doi:10.1145/321296.321305) of the logarithms of the spreads: the updates alone gain
+    a digit in five.
+    """
+    before, after = (np.stack([_log_sigmas(u[k]) for u in updates[-_MEMORY:]]) for k in (0, 1))
+    moved = after - before
+    if len(moved) > 1:
+        weights = np.linalg.lstsq(np.diff(moved, axis=0).T, moved[-1], rcond=None)[0]
+        step = np.diff(after, axis=0).T @ weights
+        if np.max(np.abs(step)) < _FARTHEST:
+            return _with_log_sigmas(updates[-1][1], after[-1] - step)
+    return updates[-1][1]
+
+
+def largest_change(before: VarianceComponents, after: VarianceComponents) -> float:
+    """Return the largest change of the logarithm of a spread."""
+    return float(np.max(np.abs(_log_sigmas(after) - _log_sigmas(before))))
+
+
+def _log_sigmas(components: VarianceComponents) -> Array:
+    lattice = np.zeros(0) if components.lattice_sigma is None else components.lattice_sigma
+    visits = np.array([components.scale.sigma, components.visit_height.sigma])
+    return np.log(
+        np.concatenate([visits, components.height_sigma_m, components.drift_sigma_px, lattice])
+    )
+
+
+def _with_log_sigmas(components: VarianceComponents, logarithms: Array) -> VarianceComponents:
+    sigmas, views = np.exp(logarithms), len(components.height_sigma_m)
+    visits, heights, drifts, lattice = np.split(sigmas, [2, 2 + views, 2 + 2 * views])
+    return VarianceComponents(
+        replace(components.scale, sigma=float(visits[0])),
+        replace(components.visit_height, sigma=float(visits[1])),
+        heights,
+        drifts,
+        None if components.lattice_sigma is None else lattice,
     )
 
 
