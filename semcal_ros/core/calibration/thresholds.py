@@ -49,8 +49,9 @@ MOVED_MIN = TABLE.derived(
 )
 VIEWS_MAX = TABLE.measured(
     "VIEWS_MAX", 300, "views",
-    "That an acquisition takes by default. Three seeds of a microscope with a one-axis stage needed 111, 153 and "
-    "243 for 0.1 % from 500x to 10 000x; one whose further views would hardly help ends before.",
+    "That an acquisition takes by default. For 0.1 % from 500x to 10 000x, a microscope with a one-axis stage needed "
+    "111, 153 and 243 with three seeds on 23 November 2026, and 108 and 75 with the first two on the 26th; one whose "
+    "further views would hardly help ends before.",
     command="python -m benchmarks.acquisition",
 )
 SURVEY_RATIO = TABLE.stated(
