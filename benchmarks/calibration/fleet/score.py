@@ -60,7 +60,8 @@ LATER_HEIGHT_M = CalibrationOptions().height_sigma_m
 # Tilts of the planes whose points are compared, and the directions of their axes, rad.
 PLANES = ((0.0, 0.0), (0.5, 0.3), (0.5, 1.9))
 POINTS_ACROSS = 13
-_STEPS = 30
+# Steps of the pose fit at most. The tilt of a plane seen from above acts by its square, so that some take hundreds.
+_STEPS = 1000
 
 
 @dataclass(frozen=True)
