@@ -27,7 +27,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from statistics import NormalDist
 from typing import TypeVar
 
 from semcal_ros.core.arrays import Array
@@ -126,4 +125,7 @@ class Table:
 
 def sigmas_of_chance(chance: float, sides: int = 2) -> float:
     """Return the number of sigmas that a normal deviate exceeds with this chance, on both sides or on one."""
-    return -NormalDist().inv_cdf(chance / sides)
+    # Rooms without such a number have no need of scipy.
+    from scipy.special import ndtri
+
+    return -float(ndtri(chance / sides))

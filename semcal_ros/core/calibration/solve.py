@@ -56,14 +56,17 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     solve_field,
     undo_field,
 )
-from semcal_ros.core.calibration.estimator.thresholds import COARSE_TOLERANCE, DAMPING_MIN
+from semcal_ros.core.calibration.estimator.thresholds import (
+    COARSE_TOLERANCE,
+    DAMPING_MIN,
+    NAMED_MAX,
+)
 from semcal_ros.core.calibration.estimator.variance_components import (
     accelerate_components,
     largest_change,
     limit_components,
     update_components,
 )
-from semcal_ros.core.calibration.judgement.thresholds import NAMED_MAX
 from semcal_ros.core.calibration.select import Selection, select_and_adjust
 from semcal_ros.core.calibration.start import with_excess
 from semcal_ros.core.calibration.thresholds import (

@@ -17,7 +17,8 @@
 from __future__ import annotations
 
 import math
-from statistics import NormalDist
+
+from scipy.special import ndtr
 
 from semcal_ros.core.calibration.judgement.thresholds import MISFIT_SIGMA
 from semcal_ros.core.thresholds import Table
@@ -187,7 +188,7 @@ ONE_LINE_RATIO = TABLE.stated(
     "Of the smaller to the larger spread of the positions: moves along one line leave M open across it.",
 )
 ONE_SIGMA = TABLE.derived(
-    "ONE_SIGMA", NormalDist().cdf(1.0), "chance",
+    "ONE_SIGMA", float(ndtr(1.0)), "chance",
     "Of a normal deviate below 1.",
 )
 
@@ -216,4 +217,96 @@ LINES_TILT_MAX_RAD = TABLE.derived(
 VARIANCE_RATIO_KEPT = TABLE.stated(
     "VARIANCE_RATIO_KEPT", 1.5, "ratio",
     "Of observed to stated variances, up to which the stated uncertainties are kept.",
+)
+
+# Which terms the data ask for, in select.py
+
+SIZE_MAX = TABLE.cost(
+    "SIZE_MAX", 8, "coefficients",
+    "Of one function. With few magnifications, their number is the smaller limit.",
+)
+COEFFICIENT_GAIN = TABLE.derived(
+    "COEFFICIENT_GAIN", 1.0, "half chi-square",
+    "That pays for one coefficient, as in Akaike's criterion (1974, doi:10.1109/TAC.1974.1100705).",
+)
+TERM_GAIN = TABLE.derived(
+    "TERM_GAIN", 5.0, "half chi-square",
+    "For a term that is not there yet: by chance one of 640 that are not needed, twice as much being a chi-square "
+    "of one degree of freedom.",
+)
+SCAN_SIZE_MAX = TABLE.stated(
+    "SCAN_SIZE_MAX", 3, "coefficients",
+    "Of a function of the scan: coils and settling hardly change with the magnification.",
+)
+CHOICE_GAIN = TABLE.stated(
+    "CHOICE_GAIN", 2.0, "half chi-square",
+    "By which a choice has to be better than the last.",
+)
+CHOICE_ROUNDS = TABLE.cost(
+    "CHOICE_ROUNDS", 5, "rounds",
+    "Of choosing the numbers of coefficients. A choice that alternates never converges; the calibration then "
+    "carries a warning.",
+)
+FREE_ROUNDS = TABLE.stated(
+    "FREE_ROUNDS", 2, "rounds",
+    "In which a choice has no right to stay once the corners count as stated, so that it does not depend on where "
+    "the fit came from. Before, a choice that went to and fro would lead astray.",
+)
+BELIEF_STEPS = TABLE.cost(
+    "BELIEF_STEPS", 3, "steps",
+    "In which corners come to be believed.",
+)
+BELIEF_STEP_MIN = TABLE.cost(
+    "BELIEF_STEP_MIN", 0.7, "of the excess noise",
+    "Beyond which there is no further step.",
+)
+FIELD_ROUNDS = TABLE.cost(
+    "FIELD_ROUNDS", 30, "rounds",
+    "Of field and adjustment.",
+)
+CHOOSING_ROUNDS = TABLE.cost(
+    "CHOOSING_ROUNDS", 2, "rounds",
+    "In which strength and numbers of coefficients may change; with both fixed, the rounds converge.",
+)
+EXPLAINED_MIN = TABLE.stated(
+    "EXPLAINED_MIN", 0.2, "of the misfit",
+    "That a field has to explain. Distortion of the scan that no other parameter describes was seen to be explained "
+    "to nine tenths, settling that is narrower than the knots to a quarter, and the waves of a grid to a sixth.",
+)
+FIELD_SETTLED_PX = TABLE.derived(
+    "FIELD_SETTLED_PX", 1e-3, "px",
+    "RMS change of the corrections of all corners: a fiftieth of the noise of good ones, 0.05 px.",
+)
+
+# The start, in start.py
+
+SCALE_FACTOR_MAX = TABLE.stated(
+    "SCALE_FACTOR_MAX", 3.0, "factor",
+    "Between the scale that is seen and the predicted one. Display widths of real files are 114 to 519 mm, so that "
+    "a guess from their middle is wrong by 2.1 at most; what is off by more is another unit, or no microscope.",
+)
+TWICE_OCTAVES = TABLE.stated(
+    "TWICE_OCTAVES", 0.12, "octaves",
+    "From a factor of two: with the right display width, the scale of a microscope is never so close to it.",
+)
+DISPLAY_WIDTH_LIMITS_M = TABLE.stated(
+    "DISPLAY_WIDTH_LIMITS_M", (1e-3, 100.0), "m",
+    "Widths of displays that are accepted, from a chip's to a projector's.",
+)
+UNTILTED_RAD = TABLE.derived(
+    "UNTILTED_RAD", math.radians(8.0), "rad",
+    "Apparent tilt below which a view may be untilted: an aspect ratio that is 1 % off looks like 8 degrees, cos 8 "
+    "= 0.990.",
+)
+TILTED_RAD = TABLE.derived(
+    "TILTED_RAD", 2.0 * UNTILTED_RAD, "rad",
+    "Views up to twice as much could be either.",
+)
+FIRST_UPDATES = TABLE.cost(
+    "FIRST_UPDATES", 4, "updates",
+    "Of the variance components, before anything is selected: they have to be near only.",
+)
+START_RHO_MAX = TABLE.derived(
+    "START_RHO_MAX", 1.0 / 5e-3, "1/m",
+    "The depth gradient of weakly tilted views is noisy, and a pivot nearer than 5 mm would be noise.",
 )

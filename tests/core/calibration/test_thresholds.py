@@ -40,6 +40,8 @@ from semcal_ros.core.calibration.judgement.check import CHANGES
         (10.0 * 2.0 * stats.norm.sf(judgement.DIFFERENT_SIGMAS), 100),
         (2.0 * stats.norm.sf(judgement.WRONG_QUANTILE_SIGMAS), 1.0 / judgement.WRONG_PART_MAX),
         (2.0 * stats.norm.sf((t.MISFIT_MAX - 1.0) / judgement.MISFIT_SIGMA), 370),
+        (stats.chi2.sf(2.0 * t.TERM_GAIN, 1), 640),
+        (stats.chi2.sf(estimator.JITTER_GAIN, 1), 370),
         (judgement.HYSTERESIS_FALSE_ALARMS, 3000),
     ],
 )
@@ -53,6 +55,11 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
         (1.0 - math.cos(estimator.FLAT_RAD), 0.004, 2e-4),
         (1.0 / math.sqrt(2.0 * estimator.SPREAD_COUNT_MIN), 0.35, 0.005),
         (1.0 / math.sqrt(2.0 * 100.0), 0.07, 0.001),
+        (math.sqrt(2.0 * estimator.NOTHING_DECREASE), 0.0045, 5e-5),
+        (estimator.ALONG_LINE_MIN, math.cos(math.radians(45.0)) ** 2, 1e-12),
+        (estimator.CERTAINTY_STEP**2, 4e-4, 1e-12),
+        (math.cos(t.UNTILTED_RAD), 0.990, 5e-4),
+        (0.05 / t.FIELD_SETTLED_PX, 50.0, 1e-9),
         (0.5 * estimator.HUBER_SIGMAS**2, 4.5, 0.0),
         (
             1.0

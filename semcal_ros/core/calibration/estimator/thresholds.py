@@ -177,3 +177,113 @@ SPREAD_MAX = TABLE.stated(
     "SPREAD_MAX", 20.0, "of the usual spread",
     "A larger one is a mistake, and no spread.",
 )
+
+# The bundle adjustment, in bundle_adjustment.py
+
+FIT_STEPS_MAX = TABLE.cost(
+    "FIT_STEPS_MAX", 60, "steps",
+    "A guard against endless iteration; the result says where it was reached.",
+)
+POOR_GAIN = TABLE.stated(
+    "POOR_GAIN", 0.25, "of the predicted decrease",
+    "Of a view, below which its quadratic model has failed.",
+)
+FOLLOWING_STEPS = TABLE.cost(
+    "FOLLOWING_STEPS", 6, "steps",
+    "By which the pose of such a view follows a new camera; it has to be near only, and the next step continues "
+    "from there.",
+)
+NEGLIGIBLE_CHANGE = TABLE.stated(
+    "NEGLIGIBLE_CHANGE", 1e-2, "half chi-square",
+    "Of a view, that does not count as a failure.",
+)
+ROTATION_STEP_MAX_RAD = TABLE.stated(
+    "ROTATION_STEP_MAX_RAD", 0.5, "rad",
+    "Of a rotation vector: farther away, the equations say nothing.",
+)
+ROUNDING_DAMPING = TABLE.stated(
+    "ROUNDING_DAMPING", 1e-10, "of the diagonal",
+    "That makes up for what rounding takes from the equations; it changes no sigma in the first five digits.",
+)
+NOTHING_DECREASE = TABLE.derived(
+    "NOTHING_DECREASE", 1e-5, "half chi-square",
+    "Of a step that changes nothing: it moves an unknown by 0.0045 of its sigma, sqrt(2 x 1e-5).",
+)
+COST_TOLERANCE = TABLE.stated(
+    "COST_TOLERANCE", 1e-7, "of the cost",
+    "Decrease below which another step does not matter to the result.",
+)
+
+# The posterior, in posterior.py
+
+REMAINING_MAX = TABLE.stated(
+    "REMAINING_MAX", 1.0, "sigma",
+    "Of an unknown that is still on its way: far beyond what the last step of a converged fit leaves, some "
+    "hundredths.",
+)
+HELD_PART = TABLE.stated(
+    "HELD_PART", 0.8, "of the prior sigma",
+    "Of a constant, or of a change, beyond which the prior holds it: the data have told less than the prior.",
+)
+NAMED_MAX = TABLE.defined(
+    "NAMED_MAX", 5, "names",
+    "Of views, magnifications or unknowns in a sentence; the others are counted.",
+)
+ALONG_LINE_MIN = TABLE.derived(
+    "ALONG_LINE_MIN", 0.5, "squared cosine",
+    "Between a line of the raster and the direction in which a point is known: at 45 degrees, half; below it, a "
+    "shift along the line hardly shows.",
+)
+JITTER_LENGTHS = TABLE.stated(
+    "JITTER_LENGTHS", (0.4, 1.5, 6.0, 24.0), "lines",
+    "Of correlation, that are tried: hardly more than one line, that of one corner's window, and multiples of it up "
+    "to a quarter of a small picture. Longer ones look like a drift.",
+)
+LAG_MAX = TABLE.cost(
+    "LAG_MAX", 64, "lines",
+    "Up to which products of residuals are compared.",
+)
+JITTER_GAIN = TABLE.derived(
+    "JITTER_GAIN", 9.0, "chi-square",
+    "Below which there is no jitter: by chance in one of 370 recordings for each length, one degree of freedom.",
+)
+LAG_PAIRS_MIN = TABLE.stated(
+    "LAG_PAIRS_MIN", 20.0, "weight",
+    "Sum of the weights with which a lag is compared.",
+)
+RESERVE_SIZE = TABLE.stated(
+    "RESERVE_SIZE", 2, "coefficients",
+    "Zero ones that are added to those that were chosen: what the views leave open of them enters the covariance.",
+)
+RESERVE_SIZE_MIN = TABLE.stated(
+    "RESERVE_SIZE_MIN", 5, "coefficients",
+    "In all, at least.",
+)
+USUAL_CHANGES = TABLE.stated(
+    "USUAL_CHANGES", 0.5, "coefficients",
+    "Weight of the usual size of the changes of a function, against one that the views determine: two of them make "
+    "it half as large at the least, so that few magnifications which happen to agree do not promise too much.",
+)
+CHANGE_LIMITS = TABLE.stated(
+    "CHANGE_LIMITS", (0.1, 3.0), "of the usual size",
+    "Of the changes.",
+)
+CHANGE_UPDATES = TABLE.cost(
+    "CHANGE_UPDATES", 5, "updates",
+    "Until it changes by some per cent.",
+)
+CERTAINTY_STEP = TABLE.derived(
+    "CERTAINTY_STEP", 0.02, "of a sigma",
+    "Of a central difference, whose error is the square of it: 4e-4, far below what a share is worth.",
+)
+
+# The extrapolation of their updates, in variance_components.py
+
+SPREAD_MEMORY = TABLE.cost(
+    "SPREAD_MEMORY", 4, "updates",
+    "From which the next one is extrapolated.",
+)
+SPREAD_STEP_MAX = TABLE.cost(
+    "SPREAD_STEP_MAX", 0.5, "log",
+    "Of an extrapolation: from farther away, the updates are not linear.",
+)

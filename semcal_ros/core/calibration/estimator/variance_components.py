@@ -45,15 +45,13 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     FLAT_RAD,
     SPREAD_COUNT_MIN,
     SPREAD_MAX,
+    SPREAD_MEMORY,
     SPREAD_MIN,
+    SPREAD_STEP_MAX,
     USUAL_WEIGHT,
 )
 
 __all__ = ["accelerate_components", "largest_change", "limit_components", "update_components"]
-
-# Updates from which the next one is extrapolated, and the largest extrapolation of the logarithm of a spread: from
-# farther away the updates are not linear.
-_MEMORY, _FARTHEST = 4, 0.5
 
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
@@ -112,12 +110,14 @@ def accelerate_components(
     Anderson's extrapolation (1965, doi:10.1145/321296.321305) of the logarithms of the spreads: the updates alone gain
     a digit in five.
     """
-    before, after = (np.stack([_log_sigmas(u[k]) for u in updates[-_MEMORY:]]) for k in (0, 1))
+    before, after = (
+        np.stack([_log_sigmas(u[k]) for u in updates[-SPREAD_MEMORY:]]) for k in (0, 1)
+    )
     moved = after - before
     if len(moved) > 1:
         weights = np.linalg.lstsq(np.diff(moved, axis=0).T, moved[-1], rcond=None)[0]
         step = np.diff(after, axis=0).T @ weights
-        if np.max(np.abs(step)) < _FARTHEST:
+        if np.max(np.abs(step)) < SPREAD_STEP_MAX:
             return _with_log_sigmas(updates[-1][1], after[-1] - step)
     return updates[-1][1]
 

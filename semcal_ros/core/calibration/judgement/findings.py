@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices, mad_sigma
-from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD
+from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD, NAMED_MAX
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.judgement.thresholds import (
@@ -33,7 +33,6 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     EMPTY_PART,
     FILLED_PART,
     HELD_OUT_RATIO,
-    NAMED_MAX,
     NEXT_SIGMA_PX,
     PATTERN_PX,
     PATTERN_RATIO,

@@ -25,12 +25,11 @@ from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.problem import Setup
-from semcal_ros.core.calibration.estimator.thresholds import SPREAD_COUNT_MIN
+from semcal_ros.core.calibration.estimator.thresholds import HELD_PART, SPREAD_COUNT_MIN
 from semcal_ros.core.calibration.judgement.thresholds import (
     HYSTERESIS_FALSE_ALARMS,
     ONE_DIRECTION,
     SURPRISING_SIGMAS,
-    UNDETERMINED_PART,
 )
 from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.solve import JointFit
@@ -213,7 +212,7 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
         else "record also with the scan rotated by 90 degrees, or give the stage's tilt"
     )
     for name, label in (("aspect", "aspect ratio"), ("skew", "skew")):
-        limit = UNDETERMINED_PART * setup.change_prior_of(name)
+        limit = HELD_PART * setup.change_prior_of(name)
         weak = {g: sigma for g, sigma in sigmas[name].items() if sigma > limit}
         if not weak:
             continue

@@ -124,10 +124,6 @@ NEXT_SIGMA_PX = TABLE.stated(
     "NEXT_SIGMA_PX", 2.0, "px",
     "Predicted error, between two calibrated magnifications or at one, beyond which more images help.",
 )
-NAMED_MAX = TABLE.defined(
-    "NAMED_MAX", 5, "names",
-    "Of views or magnifications in a sentence; the others are counted.",
-)
 
 # Outliers, in outliers.py
 
@@ -235,10 +231,6 @@ DRIFT_UPDATES = TABLE.cost(
 ONE_DIRECTION = TABLE.derived(
     "ONE_DIRECTION", 0.01, "of the larger variance",
     "Of the tilts, that of the smaller direction where they are about one axis: 3 degrees beside 30.",
-)
-UNDETERMINED_PART = TABLE.stated(
-    "UNDETERMINED_PART", 0.8, "of the prior sigma",
-    "Of a change, above which a parameter is not determined: the data have told less than the prior.",
 )
 SURPRISING_SIGMAS = TABLE.derived(
     "SURPRISING_SIGMAS", 4.0, "sigma",
