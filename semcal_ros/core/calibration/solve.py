@@ -35,10 +35,8 @@ from semcal_ros.core.calibration.estimator.poses import (
 from semcal_ros.core.calibration.estimator.posterior import (
     CovarianceParts,
     LineJitter,
-    estimate_jitter,
-    linearise_padded,
+    pad,
     pad_covariance,
-    pad_functions,
     pattern_covariance,
     split_covariance,
 )
@@ -57,7 +55,6 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     undo_field,
 )
 from semcal_ros.core.calibration.estimator.thresholds import (
-    COARSE_TOLERANCE,
     DAMPING_MIN,
     NAMED_MAX,
 )
@@ -74,6 +71,8 @@ from semcal_ros.core.calibration.thresholds import (
     EXACT_TOLERANCE,
     SPREAD_CHANGE,
     SPREAD_UPDATES_MAX,
+    UPDATE_PREDICTED,
+    UPDATE_TOLERANCE,
 )
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -142,7 +141,13 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     updates: list[tuple[VarianceComponents, VarianceComponents]] = []
     while len(updates) < SPREAD_UPDATES_MAX:
         problem = build_problem(setup, functions, setup.views, spread)
-        result = refine(problem, state, tolerance=COARSE_TOLERANCE, first_damping=DAMPING_MIN)
+        result = refine(
+            problem,
+            state,
+            tolerance=UPDATE_TOLERANCE,
+            predicted=UPDATE_PREDICTED,
+            first_damping=DAMPING_MIN,
+        )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
         updates.append((spread, update_components(setup, problem, result)))
@@ -211,20 +216,17 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
         field = replace(field, system=system)
     on_stage("uncertainty", 0.9)
-    padded = pad_functions(adjustment.functions)
-    jitter = estimate_jitter(adjustment.problem, adjustment.result)
-    problem, result = linearise_padded(final, padded, adjustment)
-    covariance = pad_covariance(setup, problem, result, adjustment, field, jitter)
+    padded = pad(final, adjustment)
+    covariance = pad_covariance(setup, padded, field)
     if selection.pattern is not None:
-        covariance = covariance + pattern_covariance(setup, problem, result, selection.pattern)
-    parts = split_covariance(padded, problem, result, adjustment, jitter)
+        covariance = covariance + pattern_covariance(setup, padded, selection.pattern)
     return JointFit(
         adjustment,
-        padded,
+        padded.functions,
         covariance,
-        jitter,
+        padded.jitter,
         field,
         selection.pattern,
         selection.excess_px,
-        parts,
+        split_covariance(padded),
     )

@@ -166,6 +166,14 @@ SPREAD_CHANGE = TABLE.stated(
     "SPREAD_CHANGE", 1e-6, "of a spread",
     "A mirrored recording then gives the mirrored camera to a millionth of a sigma.",
 )
+UPDATE_TOLERANCE = TABLE.stated(
+    "UPDATE_TOLERANCE", 1e-9, "of the cost",
+    "That a fit between two updates may leave: with more, the updates were seen to go to and fro.",
+)
+UPDATE_PREDICTED = TABLE.stated(
+    "UPDATE_PREDICTED", 1e-6, "half chi-square",
+    "And what its last step may predict.",
+)
 EXACT_TOLERANCE = TABLE.stated(
     "EXACT_TOLERANCE", 1e-10, "of the cost, half chi-squares",
     "Of the last fit. It starts undamped: a damped first step along what is hardly determined is so short that it "

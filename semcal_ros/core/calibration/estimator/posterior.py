@@ -82,13 +82,13 @@ from semcal_ros.core.errors import UnusableCalibrationError
 __all__ = [
     "CovarianceParts",
     "LineJitter",
+    "PaddedAdjustment",
     "certify",
     "estimate_changes",
     "estimate_jitter",
     "jitter_covariance",
-    "linearise_padded",
+    "pad",
     "pad_covariance",
-    "pad_functions",
     "pattern_covariance",
     "split_covariance",
 ]
@@ -298,8 +298,53 @@ class CovarianceParts:
     visits: Array
 
 
-def pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
-    """Return the functions with a few more coefficients than were chosen, all zero."""
+@dataclass(frozen=True)
+class PaddedAdjustment:
+    """An adjustment at its end, with a few more coefficients than were chosen, all zero.
+
+    Attributes
+    ----------
+    chosen
+        The adjustment.
+    functions
+        The functions with these coefficients.
+    problem, result
+        The equations of all coefficients at the adjusted solution; the views are those of the adjustment, from which a
+        residual field has been taken off.
+    jitter
+        Errors that corners on neighbouring lines share.
+    line_covariance
+        (K, K) what they add to the covariance of theta.
+    """
+
+    chosen: Adjustment
+    functions: Functions
+    problem: Problem
+    result: BundleResult
+    jitter: LineJitter
+    line_covariance: Array
+
+    @property
+    def variance_factor(self) -> float:
+        """That of the residuals of the chosen adjustment."""
+        return variance_factor(self.chosen.problem, self.chosen.result)
+
+
+def pad(setup: Setup, adjustment: Adjustment) -> PaddedAdjustment:
+    """Return the adjustment with a few more coefficients; ``setup`` has the views that it was made of."""
+    functions = _pad_functions(adjustment.functions)
+    problem = build_problem(setup, functions, setup.views, adjustment.spread)
+    state = adjustment.result.state
+    state = replace(state, theta=stack_theta(setup, functions, state))
+    result = refine(problem, state, max_iterations=0)
+    problem = replace(problem, prior_sigma=estimate_changes(functions, problem, result))
+    result = refine(problem, state, max_iterations=0)
+    jitter = estimate_jitter(adjustment.problem, adjustment.result)
+    lines = jitter_covariance(problem, result, jitter)
+    return PaddedAdjustment(adjustment, functions, problem, result, jitter, lines)
+
+
+def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
     out = dict(functions)
     low, high = functions["scale"].g_range
     for name in SMOOTH_AT_LAST if low < high else ():
@@ -311,21 +356,6 @@ def pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
         zeros = np.zeros(size - own.smooth_size)
         out[name] = replace(own, coefficients=np.concatenate([smooth, zeros, jumps]))
     return out
-
-
-def linearise_padded(
-    setup: Setup, padded: Functions, adjustment: Adjustment
-) -> tuple[Problem, BundleResult]:
-    """Return the problem of the padded functions, and its equations at the adjusted solution.
-
-    The views of ``setup`` are those of the adjustment, from which a residual field has been taken off.
-    """
-    problem = build_problem(setup, padded, setup.views, adjustment.spread)
-    state = adjustment.result.state
-    state = replace(state, theta=stack_theta(setup, padded, state))
-    result = refine(problem, state, max_iterations=0)
-    problem = replace(problem, prior_sigma=estimate_changes(padded, problem, result))
-    return problem, refine(problem, state, max_iterations=0)
 
 
 def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) -> Array:
@@ -355,24 +385,17 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
     return sigma
 
 
-def pad_covariance(
-    setup: Setup,
-    problem: Problem,
-    result: BundleResult,
-    adjustment: Adjustment,
-    field: FittedField | None,
-    jitter: LineJitter,
-) -> Array:
+def pad_covariance(setup: Setup, padded: PaddedAdjustment, field: FittedField | None) -> Array:
     """Return the covariance of the coefficients of the padded functions and of the field.
 
-    ``problem`` and ``result`` are those of :func:`linearise_padded`, and ``setup`` has the views as they were observed.
+    ``setup`` has the views as they were observed.
     A coefficient that was left out is not known to be zero: where the data do not determine it, its
     prior gives its uncertainty. Nor do the data say that it is zero: the estimate may also be wrong
     by as much as all coefficients would move if the omitted ones were free. Residuals that are
     smaller than the corners say do not make it smaller; those that lines share make it larger.
     """
+    problem, result, factor = padded.problem, padded.result, padded.variance_factor
     state = result.state
-    factor = variance_factor(adjustment.problem, adjustment.result)
     size = len(state.theta) - len(setup.shared)
     if field is None:
         reduced = reduced_normal_equations(
@@ -388,44 +411,36 @@ def pad_covariance(
         moved = np.concatenate([theta - state.theta, change.ravel()])
     covariance = (covariance + np.outer(moved, moved) / factor) * max(factor, 1.0)
     count = len(state.theta)
-    covariance[:count, :count] += jitter_covariance(problem, result, jitter)
+    covariance[:count, :count] += padded.line_covariance
     keep = np.r_[0:size, count : len(moved)]
     return covariance[np.ix_(keep, keep)]
 
 
-def split_covariance(
-    padded: Functions,
-    problem: Problem,
-    result: BundleResult,
-    adjustment: Adjustment,
-    jitter: LineJitter,
-) -> CovarianceParts:
+def split_covariance(padded: PaddedAdjustment) -> CovarianceParts:
     """Split the covariance C of the padded functions into what corners, visits and left-out coefficients add.
 
-    ``problem`` and ``result`` are those of :func:`linearise_padded`.
     The information is that of the corners and that of the priors, C^-1 = N + P, so that C = C N C + C P C: the first
     is what errors of the corners do to the estimate, the second what the priors stand for does. With all corners
     ``1 + t`` times as certain, C is ``((1 + t)^2 N + P)^-1``, whose derivative at t = 0 is -2 C N C. The
     prior of the coefficients that were left out is diagonal.
     """
-    state = result.state
+    problem, state = padded.problem, padded.result.state
 
     def covariance(certainty: float) -> Array:
         scaled = replace(problem, whitening=certainty * problem.whitening)
         return refine(scaled, state, max_iterations=0).covariance
 
-    whole = result.covariance
+    whole = padded.result.covariance
     corners = (covariance(1.0 - CERTAINTY_STEP) - covariance(1.0 + CERTAINTY_STEP)) / (
         4.0 * CERTAINTY_STEP
     )
-    left = _left_out(adjustment.functions, padded)
+    left = _left_out(padded.chosen.functions, padded.functions)
     omitted = (whole[:, left] / problem.prior_sigma[left] ** 2) @ whole[left]
-    factor = max(variance_factor(adjustment.problem, adjustment.result), 1.0)
-    size = len(state.theta) - len(problem.shared)
-    own = slice(0, size)
-    shaken = jitter_covariance(problem, result, jitter)
+    factor = max(padded.variance_factor, 1.0)
+    own = slice(0, len(state.theta) - len(problem.shared))
     return CovarianceParts(
-        (factor * corners + shaken)[own, own], (factor * (whole - corners - omitted))[own, own]
+        (factor * corners + padded.line_covariance)[own, own],
+        (factor * (whole - corners - omitted))[own, own],
     )
 
 
@@ -440,17 +455,15 @@ def _left_out(chosen: Functions, padded: Functions) -> Indices:
     return np.array(out, dtype=np.intp)
 
 
-def pattern_covariance(
-    setup: Setup, problem: Problem, result: BundleResult, pattern: GridPattern
-) -> Array:
+def pattern_covariance(setup: Setup, padded: PaddedAdjustment, pattern: GridPattern) -> Array:
     """Return what an irregular grid adds to the covariance of the coefficients.
 
-    It is the difference between the covariances with the pattern unknown and with none. ``problem`` and ``result`` are
-    those of :func:`linearise_padded`.
+    It is the difference between the covariances with the pattern unknown and with none. ``setup`` has the views as they
+    were observed.
     """
     blank = blank_field(setup)
-    system = field_system(setup, problem, result, blank, of_grid=True)
-    size = len(result.state.theta) - len(setup.shared)
+    system = field_system(setup, padded.problem, padded.result, blank, of_grid=True)
+    size = len(padded.result.state.theta) - len(setup.shared)
     free = system.covariance(pattern.choice.prior)[:size, :size]
     none = system.covariance(held_prior(blank, setup.norm_px))[:size, :size]
     return free - none
