@@ -41,6 +41,8 @@ LONGEST = 5
 MANY = 10
 # Methods of a table of thresholds (semcal_ros/core/thresholds.py), by the kind of source.
 KINDS = ("derived", "measured", "defined", "cost", "stated")
+# The same beside a number, in a room with too few of them for a table: ``# Derived: half of the main lobe.``
+KIND_OF_COMMENT = re.compile(rf"#:? ({'|'.join(kind.capitalize() for kind in KINDS)}): \S")
 # Functions whose value is a number as their arguments are.
 NUMERIC = re.compile(r"(np|math)\.\w+|float|int|tuple|frozenset")
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
@@ -153,28 +155,42 @@ def _span(node: ast.stmt) -> set[int]:
 def find_constants(module: Module) -> list[tuple[str, int, str]]:
     """Find the numbers with a name at the level of a module: name, line, kind of source.
 
-    The kind is that of its row in a table of thresholds, else ``comment`` where one stands above or beside it, else
-    ``none``. Constants in adjacent lines share the comment above the first.
+    The kind is that of its row in a table of thresholds, or the first word of the comment above or beside it; else
+    ``comment`` where there is any, else ``none``. Constants in adjacent lines share the comment above the first.
     """
     found = []
     before: ast.stmt | None = None
-    explained = False
+    source = "none"
     for node in module.tree.body:
         if not isinstance(node, ast.Assign | ast.AnnAssign):
             continue
         follows = before is not None and before.end_lineno == node.lineno - 1
-        above = module.lines[node.lineno - 2].lstrip().startswith("#")
-        beside = any("#" in module.lines[line - 1] for line in _span(node))
-        explained = above or beside or (follows and explained)
+        said = _kind_of_comment(module.lines, node)
+        source = said if said != "none" or not follows else source
         before = node
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         names = [name.id for t in targets for name in ast.walk(t) if isinstance(name, ast.Name)]
         kind = _kind_of_row(node.value)
         if kind is None and not _is_number(node.value):
             continue
-        source = kind or ("comment" if explained else "none")
-        found += [(name, node.lineno, source) for name in names if CONSTANT.fullmatch(name)]
+        found += [(name, node.lineno, kind or source) for name in names if CONSTANT.fullmatch(name)]
     return found
+
+
+def _kind_of_comment(lines: list[str], node: ast.stmt) -> str:
+    """The kind of source that the comment above a statement or beside it begins with."""
+    first = node.lineno
+    while first > 1 and lines[first - 2].lstrip().startswith("#"):
+        first -= 1
+    above = " ".join(line.strip() for line in lines[first - 1 : node.lineno - 1])
+    beside = " ".join(
+        line[line.index("#") :]
+        for line in (lines[number - 1] for number in sorted(_span(node)))
+        if "#" in line
+    )
+    texts = [text for text in (above, beside) if text]
+    kinds = [found[1].lower() for text in texts if (found := KIND_OF_COMMENT.match(text))]
+    return kinds[0] if kinds else "comment" if texts else "none"
 
 
 def _kind_of_row(value: ast.expr | None) -> str | None:
@@ -186,11 +202,13 @@ def _kind_of_row(value: ast.expr | None) -> str | None:
 
 
 def _is_number(value: ast.expr | None) -> bool:
-    """Whether an expression is made of numbers alone: ``-2.0``, ``(0.5, 1 / 3)``, ``np.linspace(0.0, 1.0, 5)``."""
+    """Whether an expression is of numbers: ``-2.0``, ``(0.5, 1 / 3)``, ``np.linspace(0.0, 1.0, 5)``, ``{"x": 1}``."""
     if isinstance(value, ast.Constant):
         return type(value.value) in (int, float)
     if isinstance(value, ast.Tuple | ast.List):
         return bool(value.elts) and all(map(_is_number, value.elts))
+    if isinstance(value, ast.Dict):
+        return bool(value.values) and all(map(_is_number, value.values))
     if isinstance(value, ast.BinOp):
         return _is_number(value.left) and _is_number(value.right)
     if isinstance(value, ast.UnaryOp):

@@ -44,13 +44,8 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.ladder.adjustment import adjust
 from semcal_ros.core.ladder.extend import LadderMeasurement, make_model
 from semcal_ros.core.ladder.residuals import Link, make_link
-from semcal_ros.core.ladder.unknowns import (
-    POSE_SIZE,
-    LadderState,
-    PicturePlace,
-    make_setup,
-    start_state,
-)
+from semcal_ros.core.ladder.thresholds import POSE_SIZE
+from semcal_ros.core.ladder.unknowns import LadderState, PicturePlace, make_setup, start_state
 
 Array = NDArray[np.float64]
 PLOT = Path(__file__).resolve().parents[2] / "bench_output" / "observable.png"

@@ -38,7 +38,8 @@ from joblib import Parallel, delayed
 from benchmarks.calibration.check import STAGE
 from benchmarks.calibration.coverage import PRESETS
 from benchmarks.table import quick_from_command_line, show
-from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, plan_views
+from semcal_ros.core.calibration.judgement.plan import plan_views
+from semcal_ros.core.calibration.judgement.thresholds import PLANNED_TILTS_RAD
 from semcal_ros.core.calibration.judgement.update import update_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views

@@ -27,7 +27,7 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import config_option, options_of, refuse_with, require_folder
 from semcal_ros.config.config import load_config
-from semcal_ros.core.calibration.acquisition import MOST_VIEWS
+from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.ladder.plan import plan_ladder
 from semcal_ros.workflows.options import Option
@@ -93,7 +93,7 @@ class AcquisitionOptions:
     ] = "scan_rotation"
     most_views: Annotated[
         int, Option("End after so many views, with the target met or not.", between=(6, 1000))
-    ] = MOST_VIEWS
+    ] = VIEWS_MAX
     record: Annotated[
         Path | None,
         Option(

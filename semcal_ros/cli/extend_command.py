@@ -32,9 +32,9 @@ from semcal_ros.cli.output import (
 )
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
-from semcal_ros.core.ladder.adjustment import SETTLED_DRIFT_PX
 from semcal_ros.core.ladder.extend import LadderStep
 from semcal_ros.core.ladder.matching import RejectedPair
+from semcal_ros.core.ladder.thresholds import SETTLED_DRIFT_PX
 from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.extend import RecordingExtension, extend

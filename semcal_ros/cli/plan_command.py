@@ -32,13 +32,12 @@ from semcal_ros.cli.options import (
     squares_option,
 )
 from semcal_ros.cli.output import echo_json, echo_table
-from semcal_ros.core.calibration.judgement.plan import (
+from semcal_ros.core.calibration.judgement.plan import ViewPlan, plan_views
+from semcal_ros.core.calibration.judgement.thresholds import (
+    DEFAULT_AGEING,
     PLANNED_DIRECTIONS_RAD,
     PLANNED_TILTS_RAD,
-    ViewPlan,
-    plan_views,
 )
-from semcal_ros.core.calibration.judgement.update import DEFAULT_AGEING
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.ladder.plan import PlannedStep, plan_ladder
 from semcal_ros.core.wording import counted

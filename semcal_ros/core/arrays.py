@@ -44,15 +44,18 @@ AnyImage = NDArray[np.generic]
 #: Types of pixels that OpenCV resamples without a conversion.
 RESAMPLED_TYPES = ("uint8", "uint16", "float32")
 
-#: Median of a chi-square with two degrees of freedom, 2 ln 2: of the squared length of a normal
+#: Derived: median of a chi-square with two degrees of freedom, 2 ln 2: of the squared length of a normal
 #: vector in the plane, in variances per axis.
 MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
-#: The same by the number of degrees of freedom: of the square of one normal deviate, and of two.
+#: Derived: the same by the number of degrees of freedom: of the square of one normal deviate, and of two.
 MEDIAN_CHI2 = {1: 0.45493642, 2: MEDIAN_CHI2_2}
 
-# Standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
+#: Derived: Tukey's constant for his biweight, in sigmas, for an efficiency of 95 % with normal noise (Holland and
+#: Welsch 1977, doi:10.1080/03610927708827533).
+TUKEY_CONSTANT = 4.685
+# Derived: standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
 _SIGMAS_PER_MAD = 1.4826
-# Characters of a wrong value in an error, which is one line.
+# Stated: characters of a wrong value in an error, which is one line.
 _MAX_SHOWN = 80
 _TINY = float(np.finfo(np.float64).tiny)
 

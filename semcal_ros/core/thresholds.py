@@ -32,7 +32,19 @@ from typing import TypeVar
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 
-V = TypeVar("V", int, float, tuple[int, ...], tuple[float, ...], Array)
+V = TypeVar(
+    "V",
+    int,
+    float,
+    tuple[int, int],
+    tuple[float, float],
+    tuple[int, ...],
+    tuple[float, ...],
+    tuple[tuple[float, float], ...],
+    dict[str, int],
+    dict[str, float],
+    Array,
+)
 
 
 class Source(Enum):
@@ -43,7 +55,7 @@ class Source(Enum):
     MEASURED = "measured"
     """By a command of this repository, which the text gives."""
     DEFINED = "defined"
-    """It says what something is; there is nothing to be found out."""
+    """It says what something is, or how often chance may raise a false alarm; there is nothing to be found out."""
     COST = "cost"
     """It bounds time or memory, and hardly changes a result."""
     STATED = "stated"
@@ -59,7 +71,7 @@ class Threshold:
     name
         Name of the constant.
     value
-        A number, or several of one kind.
+        A number, or several of one kind: a tuple, an array, or a dictionary of them by name.
     unit
         Unit, or what the number is a part or a multiple of.
     source
@@ -69,7 +81,7 @@ class Threshold:
     """
 
     name: str
-    value: float | tuple[float, ...] | Array
+    value: object
     unit: str
     source: Source
     text: str
@@ -109,3 +121,11 @@ class Table:
             raise InvalidValueError(f"two thresholds {name}", expected="a name of its own for each")
         self._rows[name] = Threshold(name, value, unit, source, text)
         return value
+
+
+def sigmas_of_chance(chance: float, sides: int = 2) -> float:
+    """Return the number of sigmas that a normal deviate exceeds with this chance, on both sides or on one."""
+    # Rooms without such a number have no need of scipy.
+    from scipy.special import ndtri
+
+    return -float(ndtri(chance / sides))

@@ -37,7 +37,7 @@ from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.arrays import Mask, check_range
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.calibration.start import DISPLAY_WIDTH_LIMITS_M
+from semcal_ros.core.calibration.thresholds import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.core.wording import counted

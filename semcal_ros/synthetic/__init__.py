@@ -24,8 +24,6 @@ from semcal_ros.synthetic.detector import NOISE_FREE, Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
 from semcal_ros.synthetic.live import LiveFrame, LiveScene, VirtualStage
 from semcal_ros.synthetic.microscope import (
-    SIMULATED_VOLTAGE_V,
-    SIMULATED_WORKING_DISTANCE_M,
     Constant,
     Exponential,
     Logistic,
@@ -51,7 +49,6 @@ from semcal_ros.synthetic.presets import PRESETS, preset
 from semcal_ros.synthetic.render import render_frame, render_reflectivity
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.grid import (
-    SQUARES_M,
     TYPICAL_GRID,
     ChessGrid,
     FlatSpecimen,
@@ -59,6 +56,7 @@ from semcal_ros.synthetic.specimens.grid import (
     Specimen,
     square_for,
 )
+from semcal_ros.synthetic.specimens.thresholds import SQUARES_M
 from semcal_ros.synthetic.stage import (
     STAGES,
     SimulatedStage,
@@ -68,6 +66,7 @@ from semcal_ros.synthetic.stage import (
     pose_on_stage,
     read_position,
 )
+from semcal_ros.synthetic.thresholds import SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M
 from semcal_ros.synthetic.truth import TRUTH_SCHEMA, parameters_of, truth_of
 
 __all__ = [

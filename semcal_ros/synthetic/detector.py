@@ -24,35 +24,28 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.synthetic.thresholds import (
+    JITTER_MAX_PX,
+    POISSON_MAX,
+    RIDGE_PX,
+    SHIFT_REACH,
+    TOOL_CORNERS,
+    TOOL_LEVEL,
+    TOOL_RIDGES,
+)
 
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
-
-# A tenth of a per cent of a field of 4096 px: lines that jump further make no image.
-_LARGEST_JITTER_PX = 4.0
-# Samples on either side of a shifted one. A beam spot of 0.8 px leaves 13 % of the amplitude at 0.4 cycles
-# per px; below that frequency, interpolation over eight samples is right to a few per cent.
-_REACH = 4
-
-# From this many electrons on, a normal distribution has the same first two moments and a skewness
-# below 0.07.
-_POISSON_LIMIT = 200.0
-
-
-# Corners of a tip from the left, as parts of its reach and of the height of the field.
-_TIP = np.array([(-1.0, 0.15), (1.0, 0.46), (1.0, 0.54), (-1.0, 0.9)])
-# Its reflectivity, and that of the ridges along it.
-_TIP_LEVEL, _TIP_RIDGES, _RIDGE_PX = 0.85, 0.1, 9.0
 
 
 def _cover(reflectivity: Image, part: float) -> Image:
     """What is seen where a tip is in front of the specimen."""
     height, width = reflectivity.shape
-    corners = np.rint(16.0 * _TIP * [part * width, height]).astype(np.int32)
+    corners = np.rint(16.0 * TOOL_CORNERS * [part * width, height]).astype(np.int32)
     mask = np.zeros(reflectivity.shape, dtype=np.uint8)
     cv2.fillPoly(mask, [corners], 255, cv2.LINE_AA, 4)
     shown = mask.astype(np.float32) / np.float32(255.0)
-    rows = np.arange(height, dtype=np.float32)[:, None] / np.float32(_RIDGE_PX)
-    tip = np.float32(_TIP_LEVEL) + np.float32(_TIP_RIDGES) * np.sin(rows)
+    rows = np.arange(height, dtype=np.float32)[:, None] / np.float32(RIDGE_PX)
+    tip = np.float32(TOOL_LEVEL) + np.float32(TOOL_RIDGES) * np.sin(rows)
     return np.asarray(reflectivity * (1.0 - shown) + tip * shown, dtype=np.float32)
 
 
@@ -118,10 +111,10 @@ class Detector:
             raise InvalidValueError(
                 f"a tip over {self.tip:g} of the field", expected="a part of it, 0 to 1"
             )
-        if not 0.0 <= self.line_jitter_px <= _LARGEST_JITTER_PX:
+        if not 0.0 <= self.line_jitter_px <= JITTER_MAX_PX:
             raise InvalidValueError(
                 f"a line jitter of {self.line_jitter_px:g} px",
-                expected=f"0 to {_LARGEST_JITTER_PX:g} px",
+                expected=f"0 to {JITTER_MAX_PX:g} px",
             )
 
     @property
@@ -173,7 +166,7 @@ class Detector:
 
     def _count(self, signal: Image, rng: np.random.Generator) -> Image:
         mean = np.maximum(signal, 0.0) * np.float32(self.electrons)
-        if float(mean.min()) < _POISSON_LIMIT:
+        if float(mean.min()) < POISSON_MAX:
             counted = rng.poisson(mean).astype(np.float32)
         else:
             counted = rng.standard_normal(mean.shape, dtype=np.float32)
@@ -220,7 +213,7 @@ def _shift_lines(image: Image, shifts_px: Array) -> Image:
     whole = np.floor(shifts_px)
     part = shifts_px - whole
     # A value is wanted at column c - whole - part, between the samples -1 and 0 from c - whole.
-    taps = np.arange(-_REACH, _REACH)
+    taps = np.arange(-SHIFT_REACH, SHIFT_REACH)
     weights = np.ones((len(taps), len(shifts_px)))
     for row, tap in zip(weights, taps, strict=True):
         for other in taps[taps != tap]:
@@ -228,7 +221,7 @@ def _shift_lines(image: Image, shifts_px: Array) -> Image:
     # All lines at once, one multiply-add per column offset: gathering each line for itself takes 21 ms
     # at 512 x 512, this 4 ms.
     whole_px = whole.astype(np.intp)
-    first, last = -_REACH - int(whole_px.max()), _REACH - 1 - int(whole_px.min())
+    first, last = -SHIFT_REACH - int(whole_px.max()), SHIFT_REACH - 1 - int(whole_px.min())
     reach, width = max(-first, last), image.shape[1]
     padded = np.pad(image, ((0, 0), (reach, reach)), mode="edge")
     lines = np.arange(len(image))

@@ -28,13 +28,10 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
+from semcal_ros.synthetic.thresholds import WANDER_TERMS
 
 DriftFunction = Callable[[Array], Array]
 """Displacement (n, 2) in m, sem frame, at times (n,) in s: what lay at X is seen at X + drift."""
-
-# Sines in the wander: with the default periods of 120 s to 4 s each period is 30^(1/13) = 1.3 times
-# the next, which gives 2.6 sines to an octave.
-_TERMS = 14
 
 
 @dataclass(frozen=True)
@@ -88,11 +85,11 @@ class Drift:
 @lru_cache(maxsize=16)
 def _draw_spectrum(seed: int, longest_s: float, shortest_s: float) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng([seed, 77])
-    omega = 2.0 * math.pi / np.geomspace(longest_s, shortest_s, _TERMS)
-    omega *= rng.uniform(0.9, 1.1, _TERMS)
+    omega = 2.0 * math.pi / np.geomspace(longest_s, shortest_s, WANDER_TERMS)
+    omega *= rng.uniform(0.9, 1.1, WANDER_TERMS)
     amplitude = 1.0 / omega
     amplitude *= math.sqrt(2.0) / np.linalg.norm(amplitude)
-    return omega, amplitude, rng.uniform(0.0, 2.0 * math.pi, (2, _TERMS))
+    return omega, amplitude, rng.uniform(0.0, 2.0 * math.pi, (2, WANDER_TERMS))
 
 
 def _evaluate_wander(t: Array, seed: int, longest_s: float, shortest_s: float) -> Array:

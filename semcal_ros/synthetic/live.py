@@ -33,11 +33,7 @@ from semcal_ros.synthetic.pose import Pose, rotation_about_beam
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.grid import GridFaults, Specimen
 from semcal_ros.synthetic.stage import SimulatedStage, visit_scales
-
-# Changes of magnification that are remembered, for frames that have begun before them.
-_KEPT_SETTINGS = 16
-# Commands of the stage that are remembered, for the same reason.
-_COMMANDS_KEPT = 32
+from semcal_ros.synthetic.thresholds import COMMANDS_KEPT, SETTINGS_KEPT
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ class VirtualStage:
         The command, valid from then on.
     before
         The stage before that command, for the rows of a frame that were scanned earlier; the oldest of
-        ``_COMMANDS_KEPT`` rests before its command.
+        ``COMMANDS_KEPT`` rests before its command.
     """
 
     time_s: float = 0.0
@@ -92,7 +88,7 @@ class VirtualStage:
             self.rotation_at(time_s),
             velocity_m_s,
             turn_rad_s,
-            self._recent(_COMMANDS_KEPT - 1),
+            self._recent(COMMANDS_KEPT - 1),
         )
 
     def placed(self, time_s: float, position_m: tuple[float, float]) -> VirtualStage:
@@ -243,7 +239,7 @@ class LiveScene:
         Poses that were set for later times are forgotten.
         """
         earlier = [set_before for set_before in self._poses if set_before[0] < time_s]
-        self._poses = [*earlier[-_COMMANDS_KEPT:], (time_s, pose)]
+        self._poses = [*earlier[-COMMANDS_KEPT:], (time_s, pose)]
 
     def set_magnification(self, magnification: float, time_s: float = -math.inf) -> None:
         """Change the magnification from a time on; a frame that is being scanned then shows both.
@@ -266,7 +262,7 @@ class LiveScene:
         if self._settings and self._settings[-1].magnification == g:
             return
         self._settings = [setting for setting in self._settings if setting.time_s < time_s][
-            -_KEPT_SETTINGS:
+            -SETTINGS_KEPT:
         ]
         self._settings.append(_Setting(time_s, g, next(self._scales)))
 

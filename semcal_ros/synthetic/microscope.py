@@ -32,15 +32,12 @@ from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
-
-# A fixed-point step multiplies the error by the residual's derivative: from 10 px, 60 steps reach
-# the tolerance for derivatives up to 0.65.
-_FIXED_POINT_STEPS = 60
-# A hundred times below the 1e-8 px of the splines that render with it, and above the rounding of a
-# coordinate of 4096 px (9e-13).
-_FIXED_POINT_TOLERANCE_PX = 1e-10
-#: Ordinary values, which are told only: no image depends on them.
-SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M = 10e3, 10e-3
+from semcal_ros.synthetic.thresholds import (
+    FIXED_POINT_STEPS,
+    FIXED_POINT_TOLERANCE_PX,
+    SIMULATED_VOLTAGE_V,
+    SIMULATED_WORKING_DISTANCE_M,
+)
 
 
 @dataclass(frozen=True)
@@ -234,11 +231,11 @@ class VirtualMicroscope:
         xy = camera.undistort(raw)
         if self.residual.is_zero:
             return xy
-        for _ in range(_FIXED_POINT_STEPS):
+        for _ in range(FIXED_POINT_STEPS):
             better = camera.undistort(raw - self._residual_px(magnification, xy))
             change = float(np.nanmax(np.abs(better - xy), initial=0.0))
             xy = better
-            if change < _FIXED_POINT_TOLERANCE_PX:
+            if change < FIXED_POINT_TOLERANCE_PX:
                 return xy
         raise InvalidValueError(
             f"residual {self.residual}, whose inverse still moves by {change:.2g} px",

@@ -48,18 +48,12 @@ from semcal_ros.synthetic.stage import (
     read_position,
     visit_scales,
 )
+from semcal_ros.synthetic.thresholds import LADDER_MOVES, LADDER_STEP, RESTING_RAD
 
 SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target", "rough_target")
 
 CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in range(1, 21)))
 """100 and 500, 1000, ... 10 000, as in Malti et al. (2012)."""
-
-
-# Ratio of neighbouring magnifications of a ladder, and the moves at each, in fields of view.
-_LADDER_STEP = 1.5
-_LADDER_MOVES = ((0.0, 0.0), (0.25, 0.08), (-0.07, 0.26), (-0.2, -0.16))
-# Tilt and rotation of what is not recorded at many poses.
-_RESTING_RAD = (math.radians(8.0), 0.1)
 
 
 def specimen_for(
@@ -324,7 +318,7 @@ def zoom_plan(
     sweep = np.geomspace(first_magnification, last_magnification, frames).round(1)
     step_s = microscope.timing.acquisition_time_s if interval_s is None else interval_s
     plan = RecordingPlan(microscope, kind, (), drift, detector or Detector(), seed, stage, grid)
-    return _at_rest(plan, sweep.tolist(), step_s, pose, _RESTING_RAD, one_region=True)
+    return _at_rest(plan, sweep.tolist(), step_s, pose, RESTING_RAD, one_region=True)
 
 
 def ladder_plan(
@@ -347,7 +341,7 @@ def ladder_plan(
     """
     _require_positive("views per magnification", views)
     low, high = sorted((first_magnification, last_magnification))
-    steps = max(1, math.ceil(math.log(high / low) / math.log(_LADDER_STEP) - 1e-9))
+    steps = max(1, math.ceil(math.log(high / low) / math.log(LADDER_STEP) - 1e-9))
     ladder = (low * (high / low) ** (np.arange(steps + 1) / steps)).round(1)
     rng, scales = np.random.default_rng((seed, 0x1ADD)), visit_scales(stage, seed)
     planned: list[PlannedFrame] = []
@@ -356,7 +350,7 @@ def ladder_plan(
         for index in range(views):
             is_turned = views > 1 and index == views - 1
             turn = 0.5 * math.pi * (-1.0) ** visit if is_turned else 0.0
-            move = (0.0, 0.0) if is_turned else _LADDER_MOVES[index % len(_LADDER_MOVES)]
+            move = (0.0, 0.0) if is_turned else LADDER_MOVES[index % len(LADDER_MOVES)]
             place = field_m * (np.array(move) + rng.normal(0.0, 0.02, 2))
             # The scan turns by what is set to a tenth of a degree.
             angle = turn + math.radians(0.1) * float(rng.normal())
@@ -389,7 +383,7 @@ def steps_plan(
     steps = [g for g in magnifications for _ in range(frames)]
     step_s = microscope.timing.acquisition_time_s
     plan = RecordingPlan(microscope, kind, (), drift, detector or Detector(), seed, stage, grid)
-    return _at_rest(plan, steps, step_s, pose, _RESTING_RAD, one_region=False)
+    return _at_rest(plan, steps, step_s, pose, RESTING_RAD, one_region=False)
 
 
 def _at_rest(

@@ -29,16 +29,8 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.specimens.grid import Specimen, UnevenSpecimen
 from semcal_ros.synthetic.specimens.ray_lattice import PlaneLattice, trace_ray_lattice
+from semcal_ros.synthetic.thresholds import BLOCK_ROWS, PASS_SAMPLES, PASS_SPACING_PX
 
-# Pixel rows that are drawn at once, so that a block's arrays stay in the CPU's cache: 1 MiB for
-# each coordinate at 4096 columns without supersampling.
-_BLOCK_ROWS = 32
-# Passes that lie closer together than this are drawn once: the blur that is left out has a variance
-# of 0.2^2 / 12 px^2.
-_PASS_SPACING_PX = 0.2
-# Samples of the drift per pass when the length of its path is measured: only a vibration at a
-# multiple of seven times the pass rate escapes them.
-_SAMPLES_PER_PASS = 7
 _DEFAULT_DETECTOR = Detector()
 
 
@@ -137,7 +129,7 @@ def _add_pass(
 ) -> None:
     samples = lattice.rays.supersampling
     footprint = lattice.footprint_m()
-    for part, x, y in lattice.blocks(u, v, _BLOCK_ROWS):
+    for part, x, y in lattice.blocks(u, v, BLOCK_ROWS):
         fine = np.asarray(specimen.reflectivity(x, y, footprint), dtype=np.float32)
         rows = slice(part.start // samples, part.stop // samples)
         if samples == 1:
@@ -159,11 +151,11 @@ def _pass_groups(
     timing: ScanTiming = microscope.timing
     passes = np.arange(timing.averages)
     # Several samples per pass: a vibration in step with the passes must not go unnoticed.
-    samples = np.linspace(0.0, timing.averages, _SAMPLES_PER_PASS * timing.averages + 1)
+    samples = np.linspace(0.0, timing.averages, PASS_SAMPLES * timing.averages + 1)
     path_m = np.diff(np.asarray(drift(start_time_s + samples * timing.frame_time_s)), axis=0)
     m = microscope.camera_at(magnification).m
     path_px = m * float(np.hypot(path_m[:, 0], path_m[:, 1]).sum())
-    count = min(timing.averages, 1 + math.floor(path_px / _PASS_SPACING_PX))
+    count = min(timing.averages, 1 + math.floor(path_px / PASS_SPACING_PX))
     mean = 0.5 * (timing.averages - 1)
     return [
         (float(group.mean() - mean) * timing.frame_time_s, len(group) / timing.averages)

@@ -37,6 +37,7 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.specimens.grid import GridFaults, square_for
+from semcal_ros.synthetic.thresholds import AXIS_OFFSET_MAX_M, SCALE_SIGMA_MAX, TILT_MAX_RAD
 
 __all__ = [
     "STAGES",
@@ -50,11 +51,6 @@ __all__ = [
     "stage_views",
     "visit_scales",
 ]
-
-# Beyond these it is no stage of a microscope, or the unit is wrong.
-_LARGEST_OFFSET_M = 5e-3
-_LARGEST_SCALE_SIGMA = 0.05
-_STEEPEST_RAD = math.radians(70.0)
 
 
 @dataclass(frozen=True)
@@ -96,21 +92,21 @@ class SimulatedStage:
     rotation_sigma_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(abs(offset) <= _LARGEST_OFFSET_M for offset in self.miss_m):
+        if not all(abs(offset) <= AXIS_OFFSET_MAX_M for offset in self.miss_m):
             listed = " and ".join(f"{1e6 * offset:g}" for offset in self.miss_m)
             raise InvalidValueError(
                 f"a tilt axis that misses the specimen by {listed} um",
-                expected=f"at most {1e6 * _LARGEST_OFFSET_M:g} um",
+                expected=f"at most {1e6 * AXIS_OFFSET_MAX_M:g} um",
             )
-        if not 0.0 <= self.scale_sigma <= _LARGEST_SCALE_SIGMA:
+        if not 0.0 <= self.scale_sigma <= SCALE_SIGMA_MAX:
             raise InvalidValueError(
                 f"a repeatability of {100.0 * self.scale_sigma:g} %",
-                expected=f"0 to {100.0 * _LARGEST_SCALE_SIGMA:g} %",
+                expected=f"0 to {100.0 * SCALE_SIGMA_MAX:g} %",
             )
-        if not self.tilts_rad or not all(abs(tilt) <= _STEEPEST_RAD for tilt in self.tilts_rad):
+        if not self.tilts_rad or not all(abs(tilt) <= TILT_MAX_RAD for tilt in self.tilts_rad):
             raise InvalidValueError(
                 f"tilts {', '.join(f'{math.degrees(tilt):g}' for tilt in self.tilts_rad)} degrees",
-                expected=f"one or more, at most {math.degrees(_STEEPEST_RAD):g}",
+                expected=f"one or more, at most {math.degrees(TILT_MAX_RAD):g}",
             )
 
     @property

@@ -34,13 +34,14 @@ from semcal_ros.core.calibration.options import (
     CalibrationOptions,
     MethodOptions,
 )
-from semcal_ros.core.calibration.pipeline import FEWEST_VIEWS, are_enough, calibrate_views
+from semcal_ros.core.calibration.pipeline import are_enough, calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import (
     check_nominal_scale,
     check_square_sides,
     is_scale_far,
 )
+from semcal_ros.core.calibration.thresholds import VIEWS_MIN
 from semcal_ros.core.calibration.views import (
     FoundView,
     GridView,
@@ -291,7 +292,7 @@ def calibrate_found(
         raise CalibrationError(
             f"a calibration from {counted(len(collected.views), 'view')} of {counted(count, 'image')} "
             f"({group_reasons(collected.rejected)})",
-            expected=f"at least {FEWEST_VIEWS} views of the grid in different directions, or views whose tilt is known",
+            expected=f"at least {VIEWS_MIN} views of the grid in different directions, or views whose tilt is known",
             do="mend what was refused, add views, or say that the grid was not tilted (--untilted all)",
         )
     _check_scale(collected.assignment, collected.found, display_width_m)

@@ -24,11 +24,8 @@ from typing import Annotated, NamedTuple
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.check import CalibrationCheck, check_calibration
-from semcal_ros.core.calibration.judgement.update import (
-    DEFAULT_AGEING,
-    CalibrationUpdate,
-    update_calibration,
-)
+from semcal_ros.core.calibration.judgement.thresholds import DEFAULT_AGEING
+from semcal_ros.core.calibration.judgement.update import CalibrationUpdate, update_calibration
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
 from semcal_ros.core.camera.provenance import Provenance

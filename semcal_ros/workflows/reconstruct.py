@@ -32,7 +32,7 @@ from semcal_ros.applications.reconstruction import (
     measure_ball,
 )
 from semcal_ros.applications.reconstruction import reconstruct as reconstruct_structure
-from semcal_ros.applications.reconstruction.factorization import LEAST_COMMON
+from semcal_ros.applications.reconstruction.thresholds import COMMON_MIN
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.arrays import check_positive
@@ -267,12 +267,12 @@ def _leave_out_empty(keyframes: list[TrackKeyframe]) -> tuple[list[TrackKeyframe
     They would take the places of others among the keyframes that are used: a specimen that has left the field makes a
     keyframe of every frame.
     """
-    shown = [keyframe for keyframe in keyframes if len(keyframe.ids) >= LEAST_COMMON]
-    empty = [keyframe.index for keyframe in keyframes if len(keyframe.ids) < LEAST_COMMON]
+    shown = [keyframe for keyframe in keyframes if len(keyframe.ids) >= COMMON_MIN]
+    empty = [keyframe.index for keyframe in keyframes if len(keyframe.ids) < COMMON_MIN]
     if not shown or not empty:
         return keyframes, []
     note = (
-        f"{counted(len(empty), 'keyframe')} with fewer than {LEAST_COMMON} points left out, the first of them frame"
+        f"{counted(len(empty), 'keyframe')} with fewer than {COMMON_MIN} points left out, the first of them frame"
         f" {empty[0] + 1}: was the specimen in view?"
     )
     return shown, [note]

@@ -19,51 +19,98 @@ from __future__ import annotations
 import ast
 import importlib
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.thresholds import Source, Table
+from semcal_ros.core.thresholds import Source, Table, sigmas_of_chance
 from tests.helpers.project import ROOT, load_script
 
-CORE = ROOT / "semcal_ros" / "core"
-ROOMS = sorted(path.parent for path in CORE.glob("*/thresholds.py"))
-# Geometry, and nothing that could be otherwise: from a cell to its four neighbours; the unit matrix.
-NO_THRESHOLDS = {"STEPS", "_IDENTITY"}
+PACKAGE = ROOT / "semcal_ros"
+FLOORS = ("core", "applications", "synthetic")
+TABLES = sorted(path for floor in FLOORS for path in (PACKAGE / floor).rglob("thresholds.py"))
+# That of core is what a table is.
+ROOMS = [path.parent for path in TABLES if path.parent != PACKAGE / "core"]
+# A room with no more numbers than these may keep each beside its use.
+FEW = 4
+# Geometry and indices, nothing that could be otherwise: from a cell to its four neighbours; the unit matrix.
+NO_THRESHOLDS = {"STEPS", "_IDENTITY", "_MIRROR", "_PAIRS", "_SCALE"}
+# Rooms whose numbers stand beside their uses, each with a comment, until they have a table.
+NOT_YET = {"core/drift", "core/registration"}
+house = load_script("house")
 
 
-@pytest.fixture(params=ROOMS, ids=lambda room: room.name)
+def _name(room: Path) -> str:
+    return room.relative_to(PACKAGE).as_posix()
+
+
+@pytest.fixture(params=ROOMS, ids=_name)
 def room(request: pytest.FixtureRequest) -> Path:
     return request.param
 
 
-def _table(room: Path) -> tuple[object, Table]:
-    module = importlib.import_module(f"semcal_ros.core.{room.name}.thresholds")
+def _table(room: Path) -> tuple[ModuleType, Table]:
+    module = importlib.import_module(".".join(room.relative_to(ROOT).parts) + ".thresholds")
     return module, module.TABLE
 
 
+def _modules(room: Path) -> list[Any]:
+    """The modules of a room, without those of the rooms in it."""
+    return [
+        m
+        for m in house.read_modules(ROOT, _name(room))
+        if m.path.count("/") == _name(room).count("/") + 1
+    ]
+
+
 def test_no_number_of_the_room_stands_elsewhere(room: Path) -> None:
-    house = load_script("house")
-    modules = house.read_modules(ROOT, f"core/{room.name}")
-    named = {m.path: {name for name, _, _ in house.find_constants(m)} for m in modules}
+    named = {m.path: {name for name, _, _ in house.find_constants(m)} for m in _modules(room)}
     rows = list(_table(room)[1])
-    assert len(named.pop(f"core/{room.name}/thresholds.py")) == len(rows) > 20
+    assert len(named.pop(f"{_name(room)}/thresholds.py")) == len(rows) > FEW
     assert {p: names for p, names in named.items() if names - NO_THRESHOLDS} == {}
 
 
+def test_numbers_without_a_table_are_few_and_say_their_source() -> None:
+    found: dict[str, list[tuple[str, str]]] = {}
+    for module in (m for floor in FLOORS for m in house.read_modules(ROOT, floor)):
+        place = module.path.rpartition("/")[0]
+        if PACKAGE / place not in ROOMS and place not in NOT_YET:
+            found.setdefault(place, []).extend(
+                (name, kind) for name, _, kind in house.find_constants(module)
+            )
+    assert {place: len(rows) for place, rows in found.items() if len(rows) > FEW} == {}
+    kinds = {source.value for source in Source}
+    assert [name for rows in found.values() for name, kind in rows if kind not in kinds] == []
+
+
 def test_every_number_is_used_and_has_a_unit_and_a_source(room: Path) -> None:
-    used = {
-        node.id
-        for path in room.glob("*.py")
-        if path.stem != "thresholds"
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Name)
-    }
     module, table = _table(room)
+    name = module.__name__
+    used = {
+        alias.name
+        for path in PACKAGE.rglob("*.py")
+        if name in (text := path.read_text(encoding="utf-8"))
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.ImportFrom) and node.module == name
+        for alias in node.names
+    }
     for row in table:
         assert getattr(module, row.name) is row.value
-        assert row.unit and row.text.endswith((".", ",")), row
-        assert row.name in used, row
+        said = (
+            row.text.removesuffix(")").rpartition(" (")[0]
+            if row.source is Source.MEASURED
+            else row.text
+        )
+        assert row.unit and said.endswith((".", ",")), row
+        # One number may be the start of another.
+        assert row.name in used or _uses(module, row.name) > 1, row
+
+
+def _uses(module: ModuleType, name: str) -> int:
+    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+    return sum(isinstance(node, ast.Name) and node.id == name for node in ast.walk(tree))
 
 
 def test_a_name_stands_once_and_a_command_with_what_it_shows() -> None:
@@ -73,3 +120,9 @@ def test_a_name_stands_once_and_a_command_with_what_it_shows() -> None:
     assert row.source is Source.MEASURED and row.text == "Seen at most (python -m this)"
     with pytest.raises(InvalidValueError, match="two thresholds A"):
         table.stated("A", 3, "px", "Again.")
+
+
+def test_sigmas_are_the_quantiles_of_the_normal_distribution() -> None:
+    # Tables: 1.96 sigmas for 5 % on both sides, 3.09 for one in a thousand on one.
+    assert sigmas_of_chance(0.05) == pytest.approx(1.959964, abs=1e-6)
+    assert sigmas_of_chance(1e-3, sides=1) == pytest.approx(3.090232, abs=1e-6)

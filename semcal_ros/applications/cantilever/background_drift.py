@@ -31,6 +31,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.applications.cantilever.thresholds import (
+    BEAM_PART_MAX,
+    CELL_LIMIT,
+    CELL_PX,
+    DRIFT_PASSES,
+    FILL_PX,
+    INDEPENDENT_PX,
+    MOVING_CELLS_MIN,
+    MOVING_PART_MIN,
+    ROUGH_ERROR_PX,
+    ROUGH_SIDE_PX,
+    SAME_DRIFT_PX,
+    SOFT_PX,
+    STILL_WEIGHT,
+    STRIP_SIDE_PX,
+    TEXTURE_ASPECTS,
+    TEXTURE_SIDE_PX,
+    TILE_MIN_PX,
+    TILES,
+    TILES_MIN,
+)
 from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.drift.estimates import DriftPath, DriftSettings
 from semcal_ros.core.drift.history import DriftHistory
@@ -44,49 +65,6 @@ from semcal_ros.core.registration.register import (
     register,
 )
 from semcal_ros.core.wording import omit_numbers
-
-# The rough drift is measured in an image reduced to between 256 and 512 px along its shorter side,
-# by the median shift of its tiles.
-_FIRST_PX = 256
-# Tiles along the shorter side.
-_TILES = 4
-# A region that is further from the median moves by itself, px of the reduced image: ten times the error of the median.
-_INDEPENDENT_MOTION_PX = 1.0
-# A smaller tile holds too little texture for a peak that stands out.
-_LEAST_TILE_PX = 64
-# The median of three is right even if one of them is wrong.
-_LEAST_TILES = 3
-# A tile is used if the beam covers less than this part of it.
-_MOSTLY = 0.5
-# Side of the cells in which changes are detected, px. With n frames, chance makes 1 in 10^4 cells
-# exceed the usual range by a factor of 1 + 4 / sqrt(n).
-_CELL_PX = 8
-# Factor of 1 / sqrt(n) in that range.
-_CHANCE = 4.0
-# Error of the rough drift to either side, px: 0.1 px of an image reduced four times. It may
-# change the grey levels of a static edge by twice the error times the slope.
-_ROUGH_PX = 0.4
-# Passes of the tracker. Covered areas that do not move with the drift pull it towards the shift that they have, by
-# 3 nm where that is 2 px wrong, and a static edge that is compared with a place beside it seems to move. So it is
-# tracked again with the drift that was found ...
-_PASSES = 3
-# ... unless that differs from the drift that was used by less than this, px: a tenth of an error that does harm.
-_SAME_PX = 0.15
-# A body counts as moving if at least this many of its cells change ...
-_LEAST_CELLS = 4
-# ... and at least this share of them: in a large body a few cells exceed the limit by chance.
-_BODY_SHARE = 0.03
-# Weight of pixels that show nothing of the cover.
-_STILL = 0.99
-# Least side of a square of such pixels in which the noise is measured, px: the corners of its spectrum
-# have some 70 coefficients, which tell the noise to 17 %. A strip of the same area may be half as wide.
-_LEAST_TEXTURE_PX, _LEAST_SIDE_PX = 32, 16
-# Width over height of the rectangles that are tried.
-_TEXTURE_ASPECTS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-# Sigma of the soft rim of a covered area, px: a sharp rim would be an edge for the tracker.
-_SOFT_PX = 3.0
-# Sigma over which the surrounding ground fills a covered area, px: several widths of the rim.
-_FILL_PX = 14.0
 
 
 @dataclass(frozen=True)
@@ -170,11 +148,11 @@ def follow_background(
         beam &= along > first - 0.2 * axis.half_width_m
     shifts, regions = _estimate_rough_drift(grey, beam)
     notify = on_frame
-    for _ in range(_PASSES):
+    for _ in range(DRIFT_PASSES):
         background = _track(grey, times_s, plane, beam, shifts, notify)
         found = background.path.drift_px
         found = np.where(np.isfinite(found), found, shifts)
-        if np.max(np.abs(found - shifts)) < _SAME_PX:
+        if np.max(np.abs(found - shifts)) < SAME_DRIFT_PX:
             break
         shifts, notify = found, lambda: None
     return replace(background, regions=regions)
@@ -213,7 +191,7 @@ def _estimate_rough_drift(
     The shift is the median over the tiles: a pusher moves or covers only some of them. Where fewer than three are
     followed, the shift of the frame before stays.
     """
-    shrink = max(1, min(beam.shape) // _FIRST_PX)
+    shrink = max(1, min(beam.shape) // ROUGH_SIDE_PX)
     if shrink > 1:
         size = (beam.shape[1] // shrink, beam.shape[0] // shrink)
         small = [
@@ -231,12 +209,12 @@ def _estimate_rough_drift(
             replace(r, box_px=tuple(shrink * side for side in r.box_px)) for r in regions
         )
     height, width = beam.shape
-    side = max(_LEAST_TILE_PX, min(height, width) // _TILES)
+    side = max(TILE_MIN_PX, min(height, width) // TILES)
     tiles = []
     for top in np.linspace(0, height - side, max(height // side, 1)).astype(int):
         for left in np.linspace(0, width - side, max(width // side, 1)).astype(int):
             part = slice(top, top + side), slice(left, left + side)
-            if beam[part].mean() < _MOSTLY:
+            if beam[part].mean() < BEAM_PART_MAX:
                 tiles.append((part, prepare_reference(_cover(images[0], _soften(beam))[part])))
     shift, shifts = np.zeros(2), [np.zeros(2)]
     failures: list[list[Rejection[MatchFailure] | None]] = [[] for _ in tiles]
@@ -248,7 +226,7 @@ def _estimate_rough_drift(
             for part, reference in tiles
         ]
         good = [f.shift_px for f in found if f.accepted]
-        if len(good) >= min(_LEAST_TILES, len(tiles)) and good:
+        if len(good) >= min(TILES_MIN, len(tiles)) and good:
             shift = np.asarray(np.median(np.array(good), axis=0))
         shifts.append(shift.copy())
         for of_region, one in zip(failures, found, strict=True):
@@ -263,7 +241,7 @@ def _estimate_rough_drift(
 def _find_independent_motion(against_px: Array) -> Rejection[MatchFailure] | None:
     """Say so where a region moves against the others by more than they are known."""
     away_px = float(np.hypot(*against_px))
-    if away_px <= _INDEPENDENT_MOTION_PX:
+    if away_px <= INDEPENDENT_PX:
         return None
     return Rejection(MatchFailure.OUTLIER, f"moves against the others by {away_px:.2g} px")
 
@@ -276,9 +254,9 @@ def _find_texture(weight: Image, drift_px: float) -> Region | None:
     """
     margin = int(np.ceil(drift_px)) + 1
     best: Region | None = None
-    area = _LEAST_TEXTURE_PX**2 - 1
-    still = (weight > _STILL).astype(np.float32)
-    for aspect in _TEXTURE_ASPECTS:
+    area = TEXTURE_SIDE_PX**2 - 1
+    still = (weight > STILL_WEIGHT).astype(np.float32)
+    for aspect in TEXTURE_ASPECTS:
         squeezed = cv2.resize(still, None, fx=1.0 / aspect, fy=1.0, interpolation=cv2.INTER_AREA)
         whole = np.pad((squeezed > 1.0 - 1e-3).astype(np.uint8), 1)
         distance = cv2.distanceTransform(whole, cv2.DIST_C, 3)[1:-1, 1:-1]
@@ -288,14 +266,14 @@ def _find_texture(weight: Image, drift_px: float) -> Region | None:
         left, right = middle - half + margin, middle + half - margin
         top, bottom = int(row) - reach + margin, int(row) + reach + 1 - margin
         sides = right - left, bottom - top
-        if min(sides) >= _LEAST_SIDE_PX and sides[0] * sides[1] > area:
+        if min(sides) >= STRIP_SIDE_PX and sides[0] * sides[1] > area:
             area, best = sides[0] * sides[1], (left, top, right, bottom)
     return best
 
 
 def _soften(beam: Mask) -> Image:
     """Return a mask that is 1 outside the beam and 0 inside, with a soft rim."""
-    return np.asarray(1.0 - cv2.GaussianBlur(beam.astype(np.float32), (0, 0), _SOFT_PX), np.float32)
+    return np.asarray(1.0 - cv2.GaussianBlur(beam.astype(np.float32), (0, 0), SOFT_PX), np.float32)
 
 
 def _shift_image(image: Image, shift: Array) -> Image:
@@ -319,12 +297,12 @@ def _find_changes(images: Sequence[Image], shifts: Array, beam: Mask) -> Mask:
     change = stack.max(axis=0) - stack.min(axis=0)
     middle = np.median(stack, axis=0)
     gy, gx = np.gradient(middle)
-    slope = np.hypot(gx, gy) / _CELL_PX
+    slope = np.hypot(gx, gy) / CELL_PX
     # Noise as most cells show it; it grows with the square root of the brightness.
     ground = _average_cells(beam.astype(np.float32)) < 0.5
     level = np.sqrt(np.maximum(middle / max(float(np.median(middle[ground])), 1.0), 0.25))
     usual = float(np.median((change / level)[ground]))
-    limit = (1.0 + _CHANCE / np.sqrt(len(stack))) * usual * level + 2.0 * _ROUGH_PX * slope
+    limit = (1.0 + CELL_LIMIT / np.sqrt(len(stack))) * usual * level + 2.0 * ROUGH_ERROR_PX * slope
     strong = change > limit
     wide = cv2.dilate(strong.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     return _enlarge(wide | _find_moving_bodies(middle, strong, ground), beam.shape)
@@ -341,30 +319,28 @@ def _find_moving_bodies(middle: Array, strong: Mask, ground: Mask) -> Mask:
     moved = np.zeros_like(strong)
     for label in range(1, count):
         body = labels == label
-        if int((near & body).sum()) >= max(_LEAST_CELLS, _BODY_SHARE * int(body.sum())):
+        if int((near & body).sum()) >= max(MOVING_CELLS_MIN, MOVING_PART_MIN * int(body.sum())):
             moved |= body
     return np.asarray(cv2.dilate(moved.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool))
 
 
 def _enlarge(cells: Mask, shape: tuple[int, ...]) -> Mask:
     """Expand cells to pixels; the last cells extend over the border that no whole cell covers."""
-    large = np.repeat(np.repeat(cells, _CELL_PX, axis=0), _CELL_PX, axis=1)
+    large = np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)
     rows, cols = shape[0] - large.shape[0], shape[1] - large.shape[1]
     return np.pad(large, ((0, rows), (0, cols)), mode="edge")
 
 
 def _average_cells(image: Image) -> Array:
-    rows, cols = (n // _CELL_PX for n in image.shape)
-    cut = image[: rows * _CELL_PX, : cols * _CELL_PX]
-    return np.asarray(
-        cut.reshape(rows, _CELL_PX, cols, _CELL_PX).mean(axis=(1, 3)), dtype=np.float64
-    )
+    rows, cols = (n // CELL_PX for n in image.shape)
+    cut = image[: rows * CELL_PX, : cols * CELL_PX]
+    return np.asarray(cut.reshape(rows, CELL_PX, cols, CELL_PX).mean(axis=(1, 3)), dtype=np.float64)
 
 
 def _cover(image: Image, weight: Image) -> Image:
     """Replace moving areas by the smooth level of the static background around them."""
-    known = np.asarray(cv2.GaussianBlur(weight, (0, 0), _FILL_PX), dtype=np.float32)
-    level = np.asarray(cv2.GaussianBlur(image * weight, (0, 0), _FILL_PX), dtype=np.float32)
+    known = np.asarray(cv2.GaussianBlur(weight, (0, 0), FILL_PX), dtype=np.float32)
+    level = np.asarray(cv2.GaussianBlur(image * weight, (0, 0), FILL_PX), dtype=np.float32)
     mean = float((image * weight).sum() / max(float(weight.sum()), 1.0))
     share = known / (known + np.float32(0.02))
     fill = share * level / np.maximum(known, np.float32(1e-6)) + (1.0 - share) * np.float32(mean)

@@ -32,46 +32,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Mask, mad_sigma
+from semcal_ros.applications.cantilever.thresholds import (
+    BENT_FRAMES_MIN,
+    BENT_SPREAD_MIN,
+    EDGES_MIN,
+    FREE_TERMS,
+    HIDDEN_PART,
+    LOAD_PLACE_MIN,
+    LOADED_PART,
+    POINT_LOAD_PROBABILITY,
+    POINT_LOAD_SIGMA,
+    PUSHED_PART,
+    ROBUST_ROUNDS,
+    ROTATION_SIGMA_RAD,
+    SHAPE_PRIOR,
+    TINY,
+    WEIGHT_MIN,
+)
+from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, Mask, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 
 SHAPES = ("free", "beam", "parabola")
-
-# 1-sigma of the rotation between frames, rad: the raster and a clamp are that stable.
-_TURN_RAD = 1e-5
-# Prior mean and 1-sigma of an unknown shape: both the parabola and the end-loaded beam are likely.
-_PRIOR = (-0.25, 0.35)
-# Where a beam is loaded if nothing shows the place: in the outer fifth of its length.
-_OUTER = (0.8, 1.0)
-# 1-sigma of c of a beam that is pushed at a known place: its section is not the same everywhere, and what pushes it is
-# no point. A load that is 3 % of the length elsewhere changes c by as much.
-_POINT_LOAD_SIGMA = 0.03
-# Probability that a beam is loaded at one place, before anything is seen: as likely as not.
-_POINT_LOAD_PROBABILITY = 0.5
-# Nearest place to the base that can be told from a load at it: there, c grows beyond all limits.
-_LEAST_LOAD = 0.4
-# Frames in which the beam is bent by this part of the largest deflection show what it is pushed by ...
-_PUSHED = 0.3
-# ... where both edges are unusable in at least this part of them.
-_HIDDEN = 0.5
-# Keeps divisions from zero, m^2: far below any variance, which is at least 1e-26 (see the prior).
-_TINY = 1e-30
-# Constants of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
-# doi:10.1080/03610927708827533).
-_TUKEY = 4.685
-# Rounds of reweighting. It converges long before that, and a linear fit costs little.
-_ROUNDS = 12
-# Unknowns of a fit with a free shape: r0, r1, and the factors of u^2 and u^3.
-_TERMS = 4
-# Least number of edges in a fit: two more than unknowns show the scatter.
-_LEAST = _TERMS + 2
-# Frames in which an edge is seen that show whether its residual grows with the deflection, and the spread of their
-# deflections in sigmas of one: of frames that are bent alike, noise would seem to grow with it.
-_LEAST_BENT = 4
-_LEAST_SPREAD = 5.0
-# An edge of a smaller weight does not count as used.
-_LEAST_WEIGHT = 0.05
 
 
 @dataclass(frozen=True)
@@ -161,25 +143,25 @@ def fit_common_shape(
     d = np.array([f.deflection_m for f in good])
     b = np.array([f.coefficients[3] for f in good])
     spread = np.array([f.covariance for f in good]).reshape(-1, 2, 2)
-    c, normal = _PRIOR[0], np.eye(2)
+    c, normal = SHAPE_PRIOR[0], np.eye(2)
     for _ in range(3):
         direction = np.array([-c, 1.0])
-        variance = np.maximum(np.einsum("i,nij,j->n", direction, spread, direction), _TINY)
+        variance = np.maximum(np.einsum("i,nij,j->n", direction, spread, direction), TINY)
         rows = np.column_stack([d, np.ones(len(d))])
-        prior = np.array([1.0 / _PRIOR[1] ** 2, 1.0 / max(reference_sigma_m**2, _TINY)])
+        prior = np.array([1.0 / SHAPE_PRIOR[1] ** 2, 1.0 / max(reference_sigma_m**2, TINY)])
         normal = (rows / variance[:, None]).T @ rows + np.diag(prior)
-        right = (rows / variance[:, None]).T @ b + np.array([prior[0] * _PRIOR[0], 0.0])
+        right = (rows / variance[:, None]).T @ b + np.array([prior[0] * SHAPE_PRIOR[0], 0.0])
         c = float(np.linalg.solve(normal, right)[0])
     along = float(np.sum((d - d.mean()) ** 2)) if len(d) > 1 else 0.0
     single = float(np.median(np.sqrt(spread[:, 0, 0]))) if len(d) else 0.0
-    apart = along > (_LEAST_SPREAD * single) ** 2
+    apart = along > (BENT_SPREAD_MIN * single) ** 2
     excess = _estimate_shared_excess(good, d, reference_count) if apart else 1.0
     if not apart and len(good):
         # Where the errors may be the same in all frames, these know no more than one.
         normal = (rows / (len(good) * variance)[:, None]).T @ rows + np.diag(prior)
     sigma = float(np.sqrt(np.linalg.inv(normal)[0, 0] * excess))
-    relative = float(np.sqrt((excess - 1.0) / max(along, _TINY))) * single
-    return Shape(c, min(sigma, _PRIOR[1]), min(relative, 1.0))
+    relative = float(np.sqrt((excess - 1.0) / max(along, TINY))) * single
+    return Shape(c, min(sigma, SHAPE_PRIOR[1]), min(relative, 1.0))
 
 
 def locate_load(u: Array, frames: Sequence[Bending]) -> tuple[float, float]:
@@ -196,20 +178,20 @@ def locate_load(u: Array, frames: Sequence[Bending]) -> tuple[float, float]:
     """
     seen = [f for f in frames if np.isfinite(f.deflection_m)]
     size = np.array([abs(f.deflection_m) for f in seen])
-    pushed = [f for f, d in zip(seen, size, strict=True) if d >= _PUSHED * size.max()]
+    pushed = [f for f, d in zip(seen, size, strict=True) if d >= PUSHED_PART * size.max()]
     if len(pushed) < 2 or len(u) < 2:
-        return _OUTER
-    hidden = np.mean([~f.used.any(axis=1) for f in pushed], axis=0) >= _HIDDEN
+        return LOADED_PART
+    hidden = np.mean([~f.used.any(axis=1) for f in pushed], axis=0) >= HIDDEN_PART
     block = float(u[1] - u[0])
     places = np.flatnonzero(hidden)
     # One block alone may be dirt; beside what is hidden, a neighbour is left out, too (see :mod:`.edges`).
     if len(places) < 2:
-        return _OUTER
+        return LOADED_PART
     last = float(u[places[-1]]) - 0.5 * block if places[-1] < len(u) - 1 else 1.0
     return min(float(u[places[0]]) + 0.5 * block, last), last
 
 
-def expect_point_load(fitted: Shape, load: tuple[float, float] = _OUTER) -> Shape:
+def expect_point_load(fitted: Shape, load: tuple[float, float] = LOADED_PART) -> Shape:
     """Combine a fitted shape with what is known of beams that are pushed.
 
     Before anything is seen, the beam is as likely as not loaded at one place; if it is
@@ -224,19 +206,19 @@ def expect_point_load(fitted: Shape, load: tuple[float, float] = _OUTER) -> Shap
         First and last place of the load, as fractions of the length, all places between them alike.
     """
     seen = max(fitted.sigma, 1e-6) ** 2
-    first, last = (max(place, _LEAST_LOAD) for place in load)
+    first, last = (max(place, LOAD_PLACE_MIN) for place in load)
     places = np.linspace(first, last, 101)
     shapes = -1.0 / (3.0 * places - 1.0)
-    mean, sigma = float(shapes.mean()), float(np.hypot(shapes.std(), _POINT_LOAD_SIGMA))
+    mean, sigma = float(shapes.mean()), float(np.hypot(shapes.std(), POINT_LOAD_SIGMA))
     share = seen / (seen + sigma**2)
     loaded, loaded_variance = fitted.value + share * (mean - fitted.value), share * sigma**2
     # The fitted shape holds the broad prior already. Its evidence is that of the frames alone under that prior.
     evidence = [
         float(np.exp(-0.5 * (fitted.value - m) ** 2 / (seen + s**2)) / np.sqrt(seen + s**2))
-        for m, s in ((mean, sigma), _PRIOR)
+        for m, s in ((mean, sigma), SHAPE_PRIOR)
     ]
-    weight = _POINT_LOAD_PROBABILITY * evidence[0]
-    weight /= max(weight + (1.0 - _POINT_LOAD_PROBABILITY) * evidence[1], _TINY)
+    weight = POINT_LOAD_PROBABILITY * evidence[0]
+    weight /= max(weight + (1.0 - POINT_LOAD_PROBABILITY) * evidence[1], TINY)
     value = weight * loaded + (1.0 - weight) * fitted.value
     variance = weight * (loaded_variance + (loaded - value) ** 2)
     variance += (1.0 - weight) * (seen + (fitted.value - value) ** 2)
@@ -249,25 +231,25 @@ def _estimate_shared_excess(frames: Sequence[Bending], d: Array, reference_count
     A bright grain beside an edge pulls the fitted edge in all frames alike; the effect of the
     reference does not depend on the deflection.
     """
-    if len(frames) < _LEAST_BENT:
+    if len(frames) < BENT_FRAMES_MIN:
         return 1.0
     left = np.stack([f.residuals.ravel() for f in frames])
     seen = np.isfinite(left)
-    whole = seen.sum(axis=0) >= _LEAST_BENT
+    whole = seen.sum(axis=0) >= BENT_FRAMES_MIN
     left, seen = left[:, whole], seen[:, whole].astype(np.float64)
     count = np.maximum(seen.sum(axis=0), 1.0)
     away = (d[:, None] - (seen * d[:, None]).sum(axis=0) / count) * seen
     power = np.sum(away**2, axis=0)
     grown = np.sum(away * np.nan_to_num(left), axis=0)
-    usable = power > _TINY
-    if int(usable.sum()) < _LEAST:
+    usable = power > TINY
+    if int(usable.sum()) < EDGES_MIN:
         return 1.0
     expected = reference_count / (reference_count + 1.0)
     ratio = float(np.mean(grown[usable] ** 2 / power[usable])) / expected
     # The fits with a free shape have taken what their four terms explain out of the residuals. With
     # narrow priors on r0 and r1 it is less, so the excess may come out a little too large.
     number = float(usable.sum())
-    return float(max(ratio * number / max(number - _TERMS, 1.0), 1.0))
+    return float(max(ratio * number / max(number - FREE_TERMS, 1.0), 1.0))
 
 
 def evaluate_bending(terms: Array, u: Array) -> Array:
@@ -312,16 +294,16 @@ def fit_bending(
     design = np.column_stack([np.ones(len(u)), u, *terms])
     rows = np.repeat(design, 2, axis=0)[usable.ravel()]
     seen, sigma = displacement_m.ravel()[usable.ravel()], sigma_m.ravel()[usable.ravel()]
-    if len(seen) < _LEAST:
+    if len(seen) < EDGES_MIN:
         return _nothing_seen(usable.shape)
     prior = np.zeros(design.shape[1])
     prior[0] = 1.0 / max(offset_sigma_m, 1e-13) ** 2
-    prior[1] = 1.0 / (_TURN_RAD * length_m) ** 2
+    prior[1] = 1.0 / (ROTATION_SIGMA_RAD * length_m) ** 2
     fitted = _fit_robustly(rows, seen, sigma, prior)
     if fitted is None:
         return _nothing_seen(usable.shape)
     solution, weight, scale, covariance = fitted
-    kept = weight > _LEAST_WEIGHT
+    kept = weight > WEIGHT_MIN
     used = np.zeros(usable.size, dtype=bool)
     used[np.flatnonzero(usable.ravel())[kept]] = True
     left = seen - rows @ solution
@@ -378,16 +360,16 @@ def _fit_robustly(
     weight = np.ones(len(seen))
     scale = 1.0
     solution: Array = np.zeros(rows.shape[1])
-    for iteration in range(_ROUNDS):
+    for iteration in range(ROBUST_ROUNDS):
         total = weight * plain / scale**2
         normal = (rows * total[:, None]).T @ rows + np.diag(prior)
         solution = np.asarray(np.linalg.solve(normal, (rows * total[:, None]).T @ seen))
         residual = (seen - rows @ solution) / sigma
         scale = max(mad_sigma(residual), 0.8)
         # The first rounds do not yet know what is an outlier.
-        far = residual / (scale * _TUKEY * (2.0 if iteration < 3 else 1.0))
+        far = residual / (scale * TUKEY_CONSTANT * (2.0 if iteration < 3 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
-        if int(np.count_nonzero(weight > _LEAST_WEIGHT)) < _LEAST:
+        if int(np.count_nonzero(weight > WEIGHT_MIN)) < EDGES_MIN:
             return None
     # The sandwich formula: the weights cost a little more than the plain inverse says.
     total = weight * plain / scale**2

@@ -27,21 +27,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
+from semcal_ros.applications.cantilever.thresholds import (
+    EDGE_PIXELS_MIN,
+    EDGE_STEPS,
+    EDGE_WIDTHS_PX,
+    TINY,
+    WIDTH_SIGMAS,
+)
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
-
-# Gauss-Newton steps. The first one finds the grey levels only; each later one moves the edge by at
-# most half the reach, so that two can bring it anywhere within reach and two more settle it.
-_STEPS = 5
-# Pixels of an edge (weighted by the taper): four for each of its three unknowns.
-_LEAST_PIXELS = 12
-# Widths (1-sigma) that are tried, px: from an edge as sharp as the pixels to 5.1 px, nearly the
-# reach; 16 % apart, since a parabola interpolates between them.
-_WIDTHS_PX = tuple(0.55 * 1.16**k for k in range(16))
-# Keeps divisions from zero.
-_TINY = 1e-30
-# Both edges of the beam move alike. If their displacements differ by more than this many sigma, one
-# of them belongs to another body.
-_SAME_WIDTH = 4.5
 
 
 @dataclass(frozen=True)
@@ -150,7 +143,7 @@ def fit_step(
     starts = np.arange(-reach, reach + 1e-15, 0.5 * model.reach_m) if reach > 0.0 else np.zeros(1)
     for start in starts:
         near = np.abs(distance_m - start) < 2.0 * model.reach_m
-        if near.sum() < _LEAST_PIXELS:
+        if near.sum() < EDGE_PIXELS_MIN:
             continue
         zero = np.zeros(int(near.sum()), dtype=np.intp)
         found = fit_blocks(zero, distance_m[near] - start, grey[near], model, 1)
@@ -166,7 +159,7 @@ def choose_width(
     along_m: Array, across_m: Array, grey: Array, model: EdgeModel, predicted_m: Array, px_m: float
 ) -> float:
     """Choose the edge width, m, with the least residuals; ``px_m`` is the size of a pixel."""
-    widths = [w * px_m for w in _WIDTHS_PX]
+    widths = [w * px_m for w in EDGE_WIDTHS_PX]
     left = [
         fit_edges(along_m, across_m, grey, replace(model, width_m=w), predicted_m).chi2
         for w in widths
@@ -174,7 +167,7 @@ def choose_width(
     k = int(np.clip(np.argmin(left), 1, len(widths) - 2))
     # Parabola through the minimum and its neighbours, in the logarithm of the width.
     a, b, c = left[k - 1], left[k], left[k + 1]
-    shift = 0.5 * (a - c) / max(a - 2.0 * b + c, _TINY)
+    shift = 0.5 * (a - c) / max(a - 2.0 * b + c, TINY)
     return float(widths[k] * 1.16 ** float(np.clip(shift, -1.0, 1.0)))
 
 
@@ -204,7 +197,7 @@ def fit_blocks(
     width, reach = model.width_m, model.reach_m
     information = np.zeros((count, 3, 3))
     squares, weight_sum = low.copy(), low.copy()
-    for iteration in range(_STEPS):
+    for iteration in range(EDGE_STEPS):
         z = distance - place[block]
         taper = np.where(np.abs(z) < reach, np.cos(0.5 * np.pi * z / reach) ** 2, 0.0)
         shape = ndtr(z / width)
@@ -228,12 +221,12 @@ def fit_blocks(
         squares = np.asarray(np.bincount(block, taper * left**2, count), dtype=np.float64)
         weight_sum = np.asarray(np.bincount(block, taper, count), dtype=np.float64)
     # The taper weights pixels at the rim less than their noise would: noise adds with its square.
-    noise = np.bincount(block, taper**2, count) / np.maximum(weight_sum, _TINY)
+    noise = np.bincount(block, taper**2, count) / np.maximum(weight_sum, TINY)
     variance = squares / np.maximum(weight_sum - 3.0 * noise, 1.0)
     inverse = np.linalg.pinv(information, hermitian=True)
     sandwich = inverse @ _accumulate_normal(block, taper**2, columns, count) @ inverse
     sigma = width * np.sqrt(np.maximum(variance * sandwich[:, 2, 2], 0.0))
-    good = (weight_sum > _LEAST_PIXELS) & (np.abs(place) < 0.95 * reach) & (step > 0.0)
+    good = (weight_sum > EDGE_PIXELS_MIN) & (np.abs(place) < 0.95 * reach) & (step > 0.0)
     sigma = np.where(good & (sigma > 0.0), sigma, np.inf)
     return place, sigma, step, float(squares.sum())
 
@@ -251,7 +244,7 @@ def _accumulate_normal(
 
 def _solve_guarded(matrix: Array, right: Array) -> Array:
     """Solve (n, 3, 3) systems that may be singular."""
-    guard = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + _TINY
+    guard = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + TINY
     return np.asarray(np.linalg.solve(matrix + guard * np.eye(3), right[..., None])[..., 0])
 
 
@@ -275,7 +268,7 @@ def find_unchanged_width(moved: Array, noise: Array) -> Mask:
     # Focus or charging may change the width of the whole beam.
     away[both] = (change[both] - np.median(change[both])) / sigma[both]
     scale = max(mad_sigma(away[both]), 1.0)
-    odd = ~both | (np.abs(away) > _SAME_WIDTH * scale)
+    odd = ~both | (np.abs(away) > WIDTH_SIGMAS * scale)
     near = odd.copy()
     near[1:] |= odd[:-1]
     near[:-1] |= odd[1:]

@@ -26,50 +26,29 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from semcal_ros.applications.cantilever.thresholds import (
+    ALIKE_PART,
+    APART_RAD,
+    BLUR_PX,
+    BORDER_PX,
+    COARSE_PX,
+    DARK_PART,
+    EDGE_PART,
+    FINE_RAD,
+    GAP_MAX,
+    LENGTH_MIN,
+    LENGTH_TOLERANCE,
+    NOWHERE,
+    SEARCHED_PX,
+    STEP_RAD,
+    STRENGTH_MIN,
+    STRIPS_MAX,
+    WIDTH_MAX,
+    WIDTH_MIN_PX,
+)
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 
-# Larger images are reduced to this size before they are searched.
-_SEARCHED_PX = 640
-# All directions are searched in an image of at most this size.
-_COARSE_PX = 256
-# Sigma of the smoothing before gradients are taken.
-_BLUR_PX = 1.5
-# Half a step turns the ends of a line across 256 px by 1.1 px: within the 3 px that are summed.
-_STEP_RAD = np.deg2rad(1.0)
-# Twice the coarse step to either side; half a fine step turns the ends across 640 px by 0.6 px.
-_FINE_RAD = np.deg2rad(np.arange(-2.0, 2.01, 0.2))
-# The two edges of a narrower strip merge under the smoothing.
-_LEAST_WIDTH_PX = 4
-# Of the shorter side: a wider bright area is not taken for a cantilever.
-_LARGEST_WIDTH = 0.35
-# Strength of a dark strip over that of a bright one. Between a bright beam and another body lies a dark strip, of which
-# one edge is the beam's own.
-_DARK = 0.7
-# Strips of each kind that are looked at, and the angle between two that are not the same one: a pusher may show more
-# contrast than the beam and lies across it.
-_CANDIDATES = 3
-_APART_RAD = np.deg2rad(10.0)
-# Of the edges of two beams side by side, all alike, the outer two must not be taken for one beam: edges between two
-# others count if they have this part of their strength. A bright rim leaves less inside a beam.
-_ALIKE = 0.8
-# A strip other than the strongest bright and the strongest dark one is taken only if it has the length that is known,
-# and at least this part of the strength of the strongest.
-_LEAST_STRENGTH = 0.3
-# Tolerance of that length: the maker's 3 %, and as much for a calibration that is not good. A tapered tip makes the
-# strip shorter by up to its width.
-_SAME_LENGTH = 0.06
-# The strip extends as far as its edges are at least this strong, relative to their 90 % quantile.
-_EDGE_SHARE = 0.35
-# Of the shorter side: shorter gaps in the edges are dirt or texture and not an end.
-_GAP = 0.06
-# Least length of a strip, of the shorter side of the image.
-_LEAST_LENGTH = 0.2
-# An end closer to the border counts as out of view: the mean along the strip reaches 4 px beyond
-# its end, and the outer 3 px are not searched.
-_BORDER_PX = 7.0
-# Index beyond any line.
-_NOWHERE = 1 << 30
 _GIVE_CLICKS = "give two points on its centre line, the base and the free end, as base and tip"
 
 
@@ -147,7 +126,7 @@ def find_strip(
     """
     if (base_px is None) != (tip_px is None):
         raise InvalidValueError("only one end of the cantilever", expected="both or none")
-    shrink = max(1, int(np.ceil(max(image.shape) / _SEARCHED_PX)))
+    shrink = max(1, int(np.ceil(max(image.shape) / SEARCHED_PX)))
     grey = np.asarray(image, dtype=np.float32)
     if shrink > 1:
         height, width = (n // shrink * shrink for n in grey.shape)
@@ -155,7 +134,7 @@ def find_strip(
         grey = np.asarray(
             cv2.resize(grey[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32
         )
-    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float64)
+    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), BLUR_PX), dtype=np.float64)
     if base_px is None or tip_px is None:
         is_dark, found = _choose_strip(smooth, None if length_px is None else length_px / shrink)
     else:
@@ -202,7 +181,7 @@ def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[floa
         if pair[first] > best[0]:
             best = (float(pair[first]), first, first + width)
     strength, first, last = best
-    least = _ALIKE * strength
+    least = ALIKE_PART * strength
     # The falling line that belongs to the first edge, and the rising line that belongs to the last one.
     inner_fall = first + low + _find_peak(fall[first + low : last - low + 1], least)
     inner_rise = last - low - _find_peak(rise[first + low : last - low + 1][::-1], least)
@@ -217,7 +196,7 @@ def _find_peak(values: Array, least: float) -> int:
     """Return the index of the first peak that is at least so high, or a large one if there is none."""
     high = np.flatnonzero(values >= least)
     if not high.size:
-        return _NOWHERE
+        return NOWHERE
     k = int(high[0])
     while k + 1 < len(values) and values[k + 1] > values[k]:
         k += 1
@@ -245,9 +224,9 @@ def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
         first_seen.add(is_dark)
         signed = -smooth if is_dark else smooth
         strength, *line = _find_pair_near(_prepare_lines(signed), angle, point)
-        strength *= _DARK if is_dark else 1.0
+        strength *= DARK_PART if is_dark else 1.0
         most = max(most, strength)
-        if strength <= 0.0 or not (is_first or strength > _LEAST_STRENGTH * most):
+        if strength <= 0.0 or not (is_first or strength > STRENGTH_MIN * most):
             continue
         try:
             found = _find_ends(signed, *line)
@@ -284,7 +263,7 @@ def _has_length(strip: Strip, length_px: float) -> bool:
     if not (strip.base_seen and strip.tip_seen):
         return False
     excess = float(np.hypot(*(strip.tip_px - strip.base_px))) - length_px
-    tolerance = _SAME_LENGTH * length_px
+    tolerance = LENGTH_TOLERANCE * length_px
     return -tolerance - 2.0 * strip.half_width_px < excess < tolerance
 
 
@@ -293,25 +272,25 @@ def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
 
     Of each: whether it is dark, its direction, and a point on it.
     """
-    shrink = max(1, int(np.ceil(max(smooth.shape) / _COARSE_PX)))
+    shrink = max(1, int(np.ceil(max(smooth.shape) / COARSE_PX)))
     size = (smooth.shape[1] // shrink, smooth.shape[0] // shrink)
     part = smooth[: size[1] * shrink, : size[0] * shrink].astype(np.float32)
     small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
     lines = _prepare_lines(small)
-    high = int(_LARGEST_WIDTH * min(small.shape))
-    least = _LEAST_WIDTH_PX // shrink + 1
+    high = int(WIDTH_MAX * min(small.shape))
+    least = WIDTH_MIN_PX // shrink + 1
     best: list[tuple[float, bool, float]] = []
     # Half a turn is enough: in the opposite direction the two edges only change places.
-    for turn in np.arange(0.0, np.pi, _STEP_RAD):
+    for turn in np.arange(0.0, np.pi, STEP_RAD):
         wide = _widen(lines.across(float(turn))[0])
         for dark, edges in ((False, wide), (True, -wide)):
             strength = _find_best_pair(edges, -edges, least, high)[0]
-            best.append((strength * (_DARK if dark else 1.0), dark, float(turn)))
+            best.append((strength * (DARK_PART if dark else 1.0), dark, float(turn)))
     directions: list[tuple[bool, float]] = []
     for strength, dark, angle in sorted(best, key=lambda one: -one[0]):
         alike = [turn for other, turn in directions if other == dark]
         apart = [abs((angle - turn + 0.5 * np.pi) % np.pi - 0.5 * np.pi) for turn in alike]
-        if strength > 0.0 and len(alike) < _CANDIDATES and min(apart, default=np.pi) >= _APART_RAD:
+        if strength > 0.0 and len(alike) < STRIPS_MAX and min(apart, default=np.pi) >= APART_RAD:
             directions.append((dark, angle))
     middle = 0.5 * (np.array(size) - 1.0)
     found: list[tuple[float, bool, float, Array]] = []
@@ -321,13 +300,13 @@ def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
         rise, fall = edges.copy(), -edges
         across = np.array([-np.sin(angle), np.cos(angle)])
         # Beside the strongest strip there may be others in the same direction.
-        for _ in range(_CANDIDATES):
+        for _ in range(STRIPS_MAX):
             strength, low, up = _find_best_pair(rise, fall, least, high)
             if strength <= 0.0:
                 break
             offset = 0.5 * (low + up) + first
             point = middle + (offset - float(across @ middle)) * across
-            factor = _DARK if dark else 1.0
+            factor = DARK_PART if dark else 1.0
             found.append((factor * strength, dark, angle, (point + 0.5) * shrink - 0.5))
             rise[max(low - 2, 0) : up + 3] = fall[max(low - 2, 0) : up + 3] = 0.0
     found.sort(key=lambda one: -one[0])
@@ -338,9 +317,9 @@ def _find_pair_near(
     lines: _Lines, nominal: float, point: Array
 ) -> tuple[float, float, float, float]:
     """Find strength, direction, distance from the origin and half width of the bright strip around a point."""
-    reach = int(_LARGEST_WIDTH * min(lines.size))
+    reach = int(WIDTH_MAX * min(lines.size))
     best, found = 0.0, (0.0, nominal, 0.0, 0.0)
-    for angle in nominal + _FINE_RAD:
+    for angle in nominal + FINE_RAD:
         sums, first = lines.across(float(angle))
         here = round(float(point[1] * np.cos(angle) - point[0] * np.sin(angle)) - first)
         wide = _widen(sums)
@@ -359,9 +338,9 @@ def _find_pair_near(
 def _find_best_around(rise: Array, fall: Array, here: int) -> tuple[float, int, int]:
     """Find the nearest rising line before a place and falling line after it that are as strong as any there."""
     strength = float(min(rise[:here].max(initial=0.0), fall[here:].max(initial=0.0)))
-    low = here - 1 - _find_peak(rise[:here][::-1], _ALIKE * strength)
-    up = here + _find_peak(fall[here:], _ALIKE * strength)
-    if strength <= 0.0 or low < 0 or up >= len(fall) or up - low < _LEAST_WIDTH_PX:
+    low = here - 1 - _find_peak(rise[:here][::-1], ALIKE_PART * strength)
+    up = here + _find_peak(fall[here:], ALIKE_PART * strength)
+    if strength <= 0.0 or low < 0 or up >= len(fall) or up - low < WIDTH_MIN_PX:
         return 0.0, 0, 0
     return min(float(rise[low]), float(fall[up])), low, up
 
@@ -379,7 +358,7 @@ def _follow_clicks(smooth: Array, base: Array, tip: Array) -> tuple[bool, Strip]
     if len(points) == 1:
         point = points[0] + inwards[0 if seen[0] else 1]
     bright, dark = (_find_pair_near(_prepare_lines(s), nominal, point) for s in (smooth, -smooth))
-    is_dark = _DARK * dark[0] > bright[0]
+    is_dark = DARK_PART * dark[0] > bright[0]
     strength, angle, offset, half = dark if is_dark else bright
     if strength <= 0.0:
         raise InvalidValueError(
@@ -408,8 +387,7 @@ def _clip_to_view(ends: list[Array], shape: tuple[int, ...]) -> tuple[Array, Arr
 def _is_inside(point: Array, shape: tuple[int, ...]) -> bool:
     x, y = point
     return bool(
-        _BORDER_PX <= x <= shape[1] - 1 - _BORDER_PX
-        and _BORDER_PX <= y <= shape[0] - 1 - _BORDER_PX
+        BORDER_PX <= x <= shape[1] - 1 - BORDER_PX and BORDER_PX <= y <= shape[0] - 1 - BORDER_PX
     )
 
 
@@ -446,9 +424,9 @@ def _find_ends(smooth: Array, angle: float, offset: float, half: float) -> Strip
     count = np.convolve(known.astype(float), weight, mode="same")
     mean = np.where(count > 4, filled / np.maximum(count, 1.0), -np.inf)
     strong = float(np.quantile(strength[known], 0.9)) if known.any() else 0.0
-    run = _find_longest_run(mean > _EDGE_SHARE * strong, max(4, int(_GAP * min(smooth.shape))))
+    run = _find_longest_run(mean > EDGE_PART * strong, max(4, int(GAP_MAX * min(smooth.shape))))
     side = min(smooth.shape)
-    if run is None or strong <= 0.0 or run[1] - run[0] < _LEAST_LENGTH * side:
+    if run is None or strong <= 0.0 or run[1] - run[0] < LENGTH_MIN * side:
         raise InvalidValueError(
             "no long enough strip in the image", expected="a cantilever", do=_GIVE_CLICKS
         )

@@ -25,17 +25,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from semcal_ros.applications.cantilever.thresholds import NODE_DEGREE, NODE_SPACING_PX
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
-
-# Spacing of the nodes at which the distortion is undone: a hundredth of the pixels. Distortion is
-# smooth, so a spline through the nodes gives the others.
-_NODE_SPACING_PX = 10.0
-# Degree of that spline, the highest that FITPACK has.
-_DEGREE = 5
 
 
 @dataclass(frozen=True)
@@ -159,9 +154,9 @@ def _compute_times(width: int, height: int, timing: ScanTiming | None) -> tuple[
 
 
 def _place_nodes(pixels: int) -> Array:
-    return np.linspace(0.0, pixels - 1.0, max(2 * _DEGREE, round(pixels / _NODE_SPACING_PX) + 1))
+    return np.linspace(0.0, pixels - 1.0, max(2 * NODE_DEGREE, round(pixels / NODE_SPACING_PX) + 1))
 
 
 def _upsample(rows: Array, cols: Array, values: Array, shape: tuple[int, int]) -> Array:
-    spline = RectBivariateSpline(rows, cols, values, kx=_DEGREE, ky=_DEGREE)
+    spline = RectBivariateSpline(rows, cols, values, kx=NODE_DEGREE, ky=NODE_DEGREE)
     return np.asarray(spline(np.arange(shape[0]), np.arange(shape[1])), dtype=np.float64)

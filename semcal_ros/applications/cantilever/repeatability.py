@@ -22,16 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.applications.cantilever.series import Series
+from semcal_ros.applications.cantilever.thresholds import OTHER_WIDTH, SPREAD_RATIO
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
-
-# Spread over what the sigmas predict from which a note says so: of three magnifications, chance makes one in 500 exceed
-# it even if the errors of all poses are the same.
-_LARGE_SPREAD = 2.5
-# Ratio of the widths at two magnifications from which they are those of two bodies: focus widens a beam of some
-# 50 px by a few per cent.
-_OTHER_WIDTH = 1.15
 
 
 @dataclass(frozen=True)
@@ -141,7 +135,7 @@ def describe_disagreement(series: Sequence[Series], found: Repeatability) -> lis
     """
     notes = []
     widths = np.array([2.0 * one.undeformed.axis.half_width_m for one in series])
-    if widths.max() > _OTHER_WIDTH * widths.min():
+    if widths.max() > OTHER_WIDTH * widths.min():
         listed = ", ".join(
             f"{1e6 * width:.3g} um at {one.magnification:g}x"
             for width, one in zip(widths, series, strict=True)
@@ -149,7 +143,7 @@ def describe_disagreement(series: Sequence[Series], found: Repeatability) -> lis
         notes.append(
             f"the beam is {listed} wide: not all of these are the same body. Look at --strip, or give base and tip"
         )
-    if found.rms_spread_m > _LARGE_SPREAD * found.expected_spread_m:
+    if found.rms_spread_m > SPREAD_RATIO * found.expected_spread_m:
         # A pose that was measured at less than two magnifications has no spread.
         known = np.flatnonzero(np.isfinite(found.spread_m))
         away = found.deflection_m[:, known] - np.nanmedian(found.deflection_m[:, known], axis=0)

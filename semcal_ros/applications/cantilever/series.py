@@ -43,9 +43,25 @@ from semcal_ros.applications.cantilever.edges import (
 )
 from semcal_ros.applications.cantilever.finding import Strip, find_strip
 from semcal_ros.applications.cantilever.plane import Axis, PlaneMap
+from semcal_ros.applications.cantilever.thresholds import (
+    BASE_SLIP_PX,
+    BASE_SLIP_SIGMAS,
+    DEFLECTION_ABSURD,
+    DEFLECTION_MAX,
+    INTERVAL_MIN,
+    LENGTH_MAX,
+    LENGTH_SIGMAS,
+    LINE_POINTS,
+    MAKER_TOLERANCE,
+    NAMED_MAX,
+    REACH_PX,
+    SAME_STEP,
+    SHAPE_SIGMAS,
+    SLIP_PX,
+    UNTRACKED_M,
+)
 from semcal_ros.applications.cantilever.tip import find_apex
 from semcal_ros.applications.cantilever.undeformed import (
-    REACH_PX,
     PixelSamples,
     UndeformedBeam,
     fit_base_edge,
@@ -58,40 +74,6 @@ from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted, omit_numbers
-
-# Range of an edge's step over that in the reference within which it counts as the same edge.
-_SAME_STEP = (0.5, 1.6)
-# What makers of cantilevers state of the length, as a fraction of it. A larger difference is told. As a uniform
-# distribution between limits it has a 1-sigma of 1.7 %.
-_MAKER_TOLERANCE = 0.03
-# Sigmas of the difference between measured and given length beyond which one of them is wrong: one of 370 right
-# lengths would be refused if all of the difference were noise, and none if the maker keeps the tolerance and ends
-# and scale are known well.
-_WRONG_LENGTH = 3.0
-# Sizes of the field of view beyond which a length has the wrong unit, since no bending would be seen.
-_LARGEST_LENGTH = 50.0
-# Deviation of the shape of the bending from a given one, in sigmas, that is told.
-_WRONG_SHAPE = 3.0
-# Largest deflection in the search if the user gives none, as a fraction of the length. The search
-# covers the area beside the beam, and a wider one may find other bodies.
-_LARGEST = 0.04
-# A fit beyond this many times the largest deflection has found something other than the beam.
-_ABSURD = 1.5
-# Median distance, px, by which the end of the strip lies elsewhere along it than in the reference, from which it is not
-# the end of a clamped beam: bent by a 25th of its length, that one comes back by a thousandth of it. The brightness of
-# the middle shows the end to 2 px. A pusher moves by its gap and the deflection.
-_SLIP_PX = 5.0
-# The same of the base, px, whose edge is found to a fraction of a pixel; and in sigmas of it.
-_BASE_SLIP_PX, _BASE_SLIP = 1.0, 3.0
-# Part of the time of a frame that is the least between two: less is no time at which a scan can have begun.
-_LEAST_INTERVAL = 0.9
-# Regions of the ground that a note names at most.
-_NAMED_REGIONS = 3
-# Points of the centre line in the results, for drawing.
-_LINE_POINTS = 65
-# 1-sigma of the offset, m, where the background was not tracked: so large that the base alone
-# determines the offset.
-_UNTRACKED_M = 1e-7
 
 
 @dataclass(frozen=True)
@@ -126,7 +108,7 @@ class SeriesSettings:
     @property
     def reach_m(self) -> float:
         """Largest deflection in the search, m."""
-        return _LARGEST * self.length_m if self.largest_m is None else self.largest_m
+        return DEFLECTION_MAX * self.length_m if self.largest_m is None else self.largest_m
 
 
 @dataclass(frozen=True)
@@ -229,7 +211,7 @@ def measure_series(
     timing, early = _check_timing(timing, times_s)
     plane = PlaneMap(camera.resized(width, height), timing)
     field_m = max(width, height) * plane.pixel_m
-    if settings.length_m > _LARGEST_LENGTH * field_m:
+    if settings.length_m > LENGTH_MAX * field_m:
         raise InvalidValueError(
             f"a cantilever of {settings.length_m:g} m where {1e6 * field_m:.3g} um are in view",
             expected="its length in m, such as 35e-6",
@@ -319,7 +301,7 @@ def _check_timing(
     if timing is None or len(times_s) < 2:
         return timing, ()
     interval_s = float(np.min(np.diff(times_s)))
-    if interval_s >= _LEAST_INTERVAL * timing.acquisition_time_s:
+    if interval_s >= INTERVAL_MIN * timing.acquisition_time_s:
         return timing, ()
     return None, (
         f"frames are {interval_s:.3g} s apart and take {timing.acquisition_time_s:.3g} s each, so their times are not "
@@ -339,15 +321,15 @@ def _check_length(undeformed: UndeformedBeam, length_m: float, camera: ScanCamer
     seen_m = undeformed.length_m if whole else axis.visible_m[1] - axis.visible_m[0]
     ends_m = undeformed.length_sigma_m if whole else undeformed.zero_sigma_m
     scale = scale_covariance(camera, seen_m * axis.direction, np.zeros(2))[:2, :2]
-    maker_m = _MAKER_TOLERANCE / np.sqrt(3.0) * length_m
+    maker_m = MAKER_TOLERANCE / np.sqrt(3.0) * length_m
     sigma_m = float(np.sqrt(ends_m**2 + axis.direction @ scale @ axis.direction + maker_m**2))
     difference_m = seen_m - length_m
-    if (abs(difference_m) if whole else difference_m) > _WRONG_LENGTH * sigma_m:
+    if (abs(difference_m) if whole else difference_m) > LENGTH_SIGMAS * sigma_m:
         raise InvalidValueError(
             f"a length of {1e6 * length_m:.4g} um for a cantilever that is {'' if whole else 'at least '}"
             f"{1e6 * seen_m:.4g} um long according to the calibration",
-            expected=f"at most {1e6 * _WRONG_LENGTH * sigma_m:.2g} um of difference ({_WRONG_LENGTH:g} sigma: "
-            f"both ends, the scale, and {100.0 * _MAKER_TOLERANCE:g} % for the maker)",
+            expected=f"at most {1e6 * LENGTH_SIGMAS * sigma_m:.2g} um of difference ({LENGTH_SIGMAS:g} sigma: "
+            f"both ends, the scale, and {100.0 * MAKER_TOLERANCE:g} % for the maker)",
             do="check --length, --base and --tip, and whether the calibration is that of this microscope",
         )
 
@@ -378,7 +360,7 @@ def _extend_to_apex(axis: Axis, plane: PlaneMap, image: AnyImage) -> Axis:
 def _compare_shapes(given: Shape, common: Shape) -> tuple[Shape, str | None]:
     """Return the given shape with the uncertainty that the frames' common one shows, and a remark if it is wrong."""
     deviation = abs(common.value - given.value)
-    if not deviation > _WRONG_SHAPE * common.sigma:
+    if not deviation > SHAPE_SIGMAS * common.sigma:
         return given, None
     # What is wrong is known, and yet the given shape was asked for: it is stated as if it were a sigma.
     return replace(given, sigma=deviation, relative=common.relative), (
@@ -411,7 +393,7 @@ def _collect_notes(
             f"no drift in {lost} of {counted(len(path), 'frame')} ({_name_reasons(path)}): {left}"
         )
         notes.extend(_name_lost_regions(background))
-    if abs(undeformed.length_m / settings.length_m - 1.0) > _MAKER_TOLERANCE:
+    if abs(undeformed.length_m / settings.length_m - 1.0) > MAKER_TOLERANCE:
         notes.append(
             f"according to the calibration the cantilever is {1e6 * undeformed.length_m:.4g} um long, not "
             f"{1e6 * settings.length_m:.4g} um: check the length, or give base and tip"
@@ -441,7 +423,7 @@ def _name_lost_regions(background: Background) -> list[str]:
         return []
     lost.sort(key=lambda region: -region.lost)
     named = []
-    for region in lost[:_NAMED_REGIONS]:
+    for region in lost[:NAMED_MAX]:
         left, top, right, bottom = region.box_px
         named.append(f"x {left} to {right}, y {top} to {bottom} px ({region.reason})")
     more = ["..."] if len(lost) > len(named) else []
@@ -550,7 +532,7 @@ class _SeriesMeasurement:
     def _describe_end_slip(self, ends_m: Array, reference: tuple[int, ...]) -> str | None:
         """Return a remark if the end moves along the strip, as that of a pusher does."""
         slip_m = np.abs(self._measure_slip(ends_m, reference))
-        if not (slip_m.size and np.median(slip_m) > _SLIP_PX * self._plane.pixel_m):
+        if not (slip_m.size and np.median(slip_m) > SLIP_PX * self._plane.pixel_m):
             return None
         return (
             f"the end of what was measured moves along it, by {1e6 * np.median(slip_m):.2g} um in half of the "
@@ -563,7 +545,7 @@ class _SeriesMeasurement:
         """Return a remark if the base moves against the ground."""
         slip_m = np.abs(self._measure_slip(np.array([b.place_m for b in bases]), reference))
         sigma_m = float(np.median([b.sigma_m for b in bases]))
-        limit_m = max(_BASE_SLIP_PX * self._plane.pixel_m, _BASE_SLIP * sigma_m)
+        limit_m = max(BASE_SLIP_PX * self._plane.pixel_m, BASE_SLIP_SIGMAS * sigma_m)
         if not (slip_m.size and np.median(slip_m) > limit_m):
             return None
         return (
@@ -602,7 +584,7 @@ class _SeriesMeasurement:
         fit = fit_edges(*samples, model, undeformed.across_m + evaluate_bending(terms, u)[:, None])
         for _ in range(2):
             rough = fit_bending(
-                u, fit.across_m - undeformed.across_m, fit.sigma_m, length, _UNTRACKED_M
+                u, fit.across_m - undeformed.across_m, fit.sigma_m, length, UNTRACKED_M
             )
             if not np.isfinite(rough.deflection_m):
                 break
@@ -623,22 +605,22 @@ class _SeriesMeasurement:
         length, normal, path = self._settings.length_m, undeformed.axis.normal, self._path
         covariance = path.covariance[:, :2, :2]
         # It is infinite where nothing was tracked at all.
-        covariance = np.where(np.isfinite(covariance), covariance, _UNTRACKED_M**2)
+        covariance = np.where(np.isfinite(covariance), covariance, UNTRACKED_M**2)
         before = np.mean([normal @ covariance[k] @ normal for k in reference]) / len(reference)
         offset = float(np.sqrt(max(normal @ covariance[frame] @ normal + before, 0.0)))
         if not _is_tied(path, frame, reference):
-            offset = max(offset, _UNTRACKED_M)
+            offset = max(offset, UNTRACKED_M)
         # A single reference frame, compared with itself, has only its own noise.
         alone = frame in reference and len(reference) == 1
         noise = fit.sigma_m if alone else np.hypot(fit.sigma_m, undeformed.sigma_m)
         ratio = fit.step / np.maximum(undeformed.step, 1e-12)
-        same = (ratio > _SAME_STEP[0]) & (ratio < _SAME_STEP[1]) & np.isfinite(undeformed.sigma_m)
+        same = (ratio > SAME_STEP[0]) & (ratio < SAME_STEP[1]) & np.isfinite(undeformed.sigma_m)
         noise = np.where(same, noise, np.inf)
         moved = fit.across_m - undeformed.across_m
         noise = np.where(find_unchanged_width(moved, noise)[:, None], noise, np.inf)
         u = undeformed.model.centres_m / length
         found = fit_bending(u, moved, noise, length, offset, shape)
-        if abs(found.deflection_m) > _ABSURD * self._settings.reach_m:
+        if abs(found.deflection_m) > DEFLECTION_ABSURD * self._settings.reach_m:
             # This is not the beam: treat the frame as if nothing had been seen.
             return fit_bending(u, moved, np.full_like(noise, np.inf), length, offset, shape)
         return found
@@ -658,7 +640,7 @@ class _SeriesMeasurement:
         )
         terms = np.nan_to_num(bending.coefficients[2:])
         end = axis.point(np.array([locate_end(terms, length)]), np.array([known]))
-        along = np.linspace(*axis.visible_m, _LINE_POINTS)
+        along = np.linspace(*axis.visible_m, LINE_POINTS)
         line = axis.point(along, evaluate_bending(terms, along / length))
         drift = self._path.drift_m[frame]
         return Deflection(

@@ -24,7 +24,7 @@ are averaged, each as likely as it fits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -32,48 +32,31 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from semcal_ros.applications.cantilever.edges import EdgeModel, fit_blocks
-from semcal_ros.core.arrays import Array, mad_sigma
+from semcal_ros.applications.cantilever.thresholds import (
+    APEX_BIN_PX,
+    BLOCK_PX,
+    BLOCKS_SPARE,
+    CORNER_RAD,
+    CORNER_WIDTHS,
+    FLANK_MAX,
+    LOSS_MAX,
+    MIDDLE_PART,
+    ROUGH_APEX_PX,
+    SETTLED_PX,
+    SHORT_REACH,
+    STRAIGHT_MIN_PX,
+    STRAIGHT_PART,
+    TIP_BLOCK_MIN_PX,
+    TIP_SEARCH,
+    TIP_STEPS,
+    WEIGHT_MIN,
+)
+from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, mad_sigma
 
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
 
 Flank = Literal["straight", "elliptic"]
-
-# Half widths before and beyond the expected end in which it is looked for: a taper is rarely longer
-# than one and a half times as wide.
-_SEARCH = 3.0
-# Bins along the beam, px: of more than a pixel, so that none is empty.
-_APEX_BIN_PX = 1.5
-# The middle of the beam, of its half width, whose brightness shows the end.
-_MIDDLE = 0.2
-# Longest flank, in half widths.
-_LONGEST = 4.0
-# The outline is followed this far into the straight sides, in half widths and at least px, so that it
-# shows where they begin.
-_STRAIGHT, _STRAIGHT_PX = 0.5, 12.0
-# Length of a block of the outline, px: as those along the beam, but at most a fourth of the half width,
-# so that the outline of a narrow beam has enough of them, and no shorter than an edge is wide.
-_BLOCK_PX, _SHORTEST_BLOCK_PX = 12.0, 4.0
-# Edges this close to a corner of the outline are rounded by the beam spot and not fitted, in widths of an edge.
-_CORNER_WIDTHS = 2.0
-# Turns of the outline per px above which it has a corner there, rad; a semicircle of 5 px has 0.2.
-_CORNER_RAD = 0.3
-# Gauss-Newton steps, each with a robust linear fit of three unknowns. The edges that were found
-# can be off by the reach of a block; some steps bring the outline there.
-_STEPS = 8
-# Smaller steps end the fit, px.
-_SETTLED_PX = 0.02
-# 1-sigma of what a bright rim or a halo, which the model of an edge lacks, moves the apex by, px: over 22
-# scenes of many looks the error was 0.07 px RMS and 0.2 px at most.
-_RIM_PX = 0.1
-# 1-sigma of the apex as the brightness of the middle of the beam alone shows it.
-ROUGH_APEX_PX = 2.0
-# Constant of Tukey's biweight (see :mod:`.bending`).
-_TUKEY = 4.685
-# The loss of an outlier, in squared deviations.
-_LARGEST_LOSS = _TUKEY**2 / 3.0
-# Blocks in excess of unknowns that show the scatter.
-_EXCESS_BLOCKS = 3
 
 
 @dataclass(frozen=True)
@@ -167,13 +150,13 @@ def find_apex(samples: PixelSamples, end_m: float, half_m: float, px_m: float) -
         Size of a pixel.
     """
     along, across, grey = samples
-    middle = np.abs(across) < max(_MIDDLE * half_m, 2.0 * px_m)
-    middle &= np.abs(along - end_m) < _SEARCH * half_m
-    background = np.abs(along - end_m) < _SEARCH * half_m
+    middle = np.abs(across) < max(MIDDLE_PART * half_m, 2.0 * px_m)
+    middle &= np.abs(along - end_m) < TIP_SEARCH * half_m
+    background = np.abs(along - end_m) < TIP_SEARCH * half_m
     background &= (np.abs(across) > 1.3 * half_m) & (np.abs(across) < 2.5 * half_m)
     if not (middle.any() and background.any()):
         return end_m
-    first, size = float(along[middle].min()), _APEX_BIN_PX * px_m
+    first, size = float(along[middle].min()), APEX_BIN_PX * px_m
     bins = np.floor((along[middle] - first) / size).astype(np.intp)
     number = np.bincount(bins)
     profile = np.bincount(bins, grey[middle]) / np.maximum(number, 1)
@@ -206,7 +189,7 @@ def fit_tip(samples: PixelSamples, rough_m: float, model: EdgeModel, px_m: float
     """
     along, across, grey = samples
     wide = model.half_width_m + 3.0 * model.reach_m
-    near = (along > rough_m - (_LONGEST + 1.0) * model.half_width_m) & (np.abs(across) < wide)
+    near = (along > rough_m - (FLANK_MAX + 1.0) * model.half_width_m) & (np.abs(across) < wide)
     samples = along[near], across[near], grey[near]
     starts = _start_outlines(samples, rough_m, model, px_m)
     fits = [fit for start in starts if (fit := _refine(samples, start, model, px_m))]
@@ -222,9 +205,24 @@ def fit_tip(samples: PixelSamples, rough_m: float, model: EdgeModel, px_m: float
     apexes, sigmas = np.array([fit[0].apex for fit in fits]), np.array([fit[1] for fit in fits])
     apex = float(likely @ apexes)
     spread = likely @ (sigmas**2 + (apexes - apex) ** 2)
-    sigma = float(np.sqrt(spread + (_RIM_PX * px_m) ** 2))
     best = fits[int(np.argmax(likely))][0]
+    sigma = float(np.hypot(np.sqrt(spread), _find_reach_error(samples, best, model, px_m)))
     return TipFit(apex, sigma, best.length, 2.0 * best.facet, best.flank)
+
+
+def _find_reach_error(
+    samples: PixelSamples, outline: _Outline, model: EdgeModel, px_m: float
+) -> float:
+    """Find the 1-sigma of what a bright rim or a halo, which the model of an edge lacks, moves the apex by.
+
+    It pulls an edge by the more, the farther the fit reaches; from the apex with a shorter reach, the one with none
+    is extrapolated.
+    """
+    shorter = replace(model, reach_m=SHORT_REACH * model.reach_m)
+    again = _refine(samples, outline, shorter, px_m)
+    if again is None:
+        return model.width_m
+    return abs(again[0].apex - outline.apex) / (1.0 - SHORT_REACH)
 
 
 def _start_outlines(
@@ -233,7 +231,7 @@ def _start_outlines(
     """Find an outline of each family near the widths that the brightness shows."""
     along, across, grey = samples
     half, size = model.half_width_m, 2.0 * px_m
-    rows = int(_LONGEST * half / size)
+    rows = int(FLANK_MAX * half / size)
     columns = int(1.6 * half / px_m) + 8
     row = np.floor((rough_m + 0.5 * half - along) / size).astype(np.intp)
     column = np.floor(np.abs(across) / px_m).astype(np.intp)
@@ -279,14 +277,14 @@ def _refine(
     """Fit an outline: it, the 1-sigma of its apex, chi2, scatter over noise, and Schwarz's penalty for its unknowns."""
     outline = start
     square = start.length <= 0.0 or start.facet >= start.half
-    for _ in range(_STEPS):
+    for _ in range(TIP_STEPS):
         found = _measure_blocks(samples, outline, model, px_m)
         if found is None:
             return None
         points, outwards, sigma, missing = found
         design = _sensitivities(outline, points, px_m, square)
         # What the edges leave open: the apex is known roughly, and a flank that nothing shows stays.
-        prior = np.array([_MIDDLE * start.half + ROUGH_APEX_PX * px_m, start.half, start.half])
+        prior = np.array([MIDDLE_PART * start.half + ROUGH_APEX_PX * px_m, start.half, start.half])
         away = np.array([start.apex - outline.apex, 0.0, 0.0])
         unknowns = design.shape[1]
         solved = _solve_robustly(design, outwards, sigma, away[:unknowns], prior[:unknowns])
@@ -299,16 +297,16 @@ def _refine(
         outline = _Outline(
             outline.flank,
             float(values[0]),
-            float(np.clip(length, 0.0, _LONGEST * outline.half)),
+            float(np.clip(length, 0.0, FLANK_MAX * outline.half)),
             float(np.clip(facet, 0.0, outline.half)),
             outline.half,
         )
-        if float(np.max(np.abs(step))) < _SETTLED_PX * px_m:
+        if float(np.max(np.abs(step))) < SETTLED_PX * px_m:
             break
         if not square and (outline.length < px_m or outline.facet > outline.half - 0.5 * px_m):
             return None  # the square one
     # Where an outline says that there is an edge and there is none, it is as wrong as it can be.
-    cost += missing * _LARGEST_LOSS * scale**2
+    cost += missing * LOSS_MAX * scale**2
     penalty = len(step) * float(np.log(len(outwards)))
     return outline, float(np.sqrt(covariance[0, 0])), cost, scale, penalty
 
@@ -317,13 +315,13 @@ def _measure_blocks(
     samples: PixelSamples, outline: _Outline, model: EdgeModel, px_m: float
 ) -> tuple[Array, Array, Array, int] | None:
     """Fit the edge in blocks along the outline: centres, how far outside it is, 1-sigma, and how many lack one."""
-    straight = max(_STRAIGHT * outline.half, _STRAIGHT_PX * px_m)
+    straight = max(STRAIGHT_PART * outline.half, STRAIGHT_MIN_PX * px_m)
     points = outline.points(0.5 * px_m, straight)
     heading = np.arctan2(*np.gradient(points, axis=0).T[::-1])
     turn = np.abs(np.gradient(np.unwrap(heading))) / 0.5
-    around = np.ones(2 * int(2.0 * _CORNER_WIDTHS * model.width_m / px_m) + 1)
-    sharp = np.convolve(turn > _CORNER_RAD, around, mode="same") > 0.5
-    block_px = np.clip(0.25 * outline.half / px_m, _SHORTEST_BLOCK_PX, _BLOCK_PX)
+    around = np.ones(2 * int(2.0 * CORNER_WIDTHS * model.width_m / px_m) + 1)
+    sharp = np.convolve(turn > CORNER_RAD, around, mode="same") > 0.5
+    block_px = np.clip(0.25 * outline.half / px_m, TIP_BLOCK_MIN_PX, BLOCK_PX)
     per_block = int(2 * block_px)
     count = max(len(points) // per_block, 1)
     number = np.minimum(np.arange(len(points)) * count // len(points), count - 1)
@@ -371,7 +369,7 @@ def _solve_robustly(
     design: Array, seen: Array, sigma: Array, expected: Array, expected_sigma: Array
 ) -> tuple[Array, Array, float, float] | None:
     """Fit by Tukey's biweight with a prior: unknowns, covariance, chi2, and the scatter over the noise."""
-    if len(seen) < design.shape[1] + _EXCESS_BLOCKS:
+    if len(seen) < design.shape[1] + BLOCKS_SPARE:
         return None
     weight, scale = np.ones(len(seen)), 1.0
     known = 1.0 / expected_sigma**2
@@ -381,10 +379,10 @@ def _solve_robustly(
         solution = inverse @ ((design * total[:, None]).T @ seen + known * expected)
         left = (seen - design @ solution) / sigma
         scale = max(mad_sigma(left), 1.0)
-        far = left / (scale * _TUKEY * (2.0 if iteration < 2 else 1.0))
+        far = left / (scale * TUKEY_CONSTANT * (2.0 if iteration < 2 else 1.0))
         weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
-        if int(np.count_nonzero(weight > 0.05)) < design.shape[1] + _EXCESS_BLOCKS:
+        if int(np.count_nonzero(weight > WEIGHT_MIN)) < design.shape[1] + BLOCKS_SPARE:
             return None
     # Of a rejected block counts what Tukey's loss counts.
-    loss = _LARGEST_LOSS * (1.0 - np.clip(1.0 - far**2, 0.0, 1.0) ** 3)
+    loss = LOSS_MAX * (1.0 - np.clip(1.0 - far**2, 0.0, 1.0) ** 3)
     return np.asarray(solution), np.asarray(inverse), float(loss.sum()) * scale**2, scale

@@ -29,35 +29,25 @@ from semcal_ros.applications.cantilever.edges import (
     fit_step,
 )
 from semcal_ros.applications.cantilever.plane import Axis
-from semcal_ros.applications.cantilever.tip import ROUGH_APEX_PX, fit_tip
+from semcal_ros.applications.cantilever.thresholds import (
+    BLOCK_PX,
+    BLOCKS_MIN,
+    BLOCKS_PART_MIN,
+    EDGE_FIRST_PX,
+    END_SEARCH_PX,
+    HOLDER_FROM_PX,
+    HOLDER_STEPS,
+    HOLDER_TO_PX,
+    REACH_MAX,
+    REACH_PX,
+    ROUGH_APEX_PX,
+)
+from semcal_ros.applications.cantilever.tip import fit_tip
 from semcal_ros.core.arrays import Array, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
 
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
-
-#: Distance from an edge up to which pixels are used, px.
-REACH_PX = 6.0
-# Width (1-sigma) of an edge to begin with, until it is fitted.
-_EDGE_PX = 1.1
-# Length of a block along the beam: as long as the pixels that count reach across an edge.
-_BLOCK_PX = 12.0
-# Least number of blocks with both edges: a fit with four unknowns needs some more.
-_LEAST_BLOCKS = 6
-# Least part of the blocks with both edges. A beam at rest shows all of them, but for dirt; on the
-# texture of the ground, chance finds a quarter to two fifths.
-_LEAST_SHARE = 0.6
-# Largest reach, in half widths: the fit of one edge of a narrow beam must not include the other.
-_REACH_OF_HALF_WIDTH = 1.5
-# The ends are searched for up to this distance from the ends of the strip.
-_END_SEARCH_PX = 14.0
-# The holder's edge is fitted between these distances from the beam: beyond the blur of the beam's
-# own edge, and no further than the holder may be taken for straight.
-_HOLDER_FROM_PX = 3.0
-# The far end of that range.
-_HOLDER_TO_PX = 24.0
-# Iterations of the fit of its slope; each leaves less than a tenth of the error.
-_ITERATIONS = 3
 
 
 @dataclass(frozen=True)
@@ -122,7 +112,7 @@ def measure_undeformed_beam(
     fits = [fit_edges(*view, model, _predict_straight_edges(model)) for view in final]
     across, sigma, step = average_edges(fits)
     found = np.isfinite(sigma).all(axis=1)
-    if int(found.sum()) < max(_LEAST_BLOCKS, _LEAST_SHARE * found.size):
+    if int(found.sum()) < max(BLOCKS_MIN, BLOCKS_PART_MIN * found.size):
         raise InvalidValueError(
             f"no beam where one was looked for: both edges are seen in {int(found.sum())} of {found.size} places",
             expected="a strip with two parallel edges from base to tip",
@@ -163,9 +153,9 @@ def _place_blocks(axis: Axis, width_m: float, px_m: float, flank_m: float = 0.0)
     first, last = axis.visible_m[0], axis.visible_m[1] - flank_m
     # Blocks keep clear of the ends of the beam, which are edges themselves.
     inset = REACH_PX * px_m
-    count = max(int((last - first - 2.0 * inset) / (_BLOCK_PX * px_m)), 1)
+    count = max(int((last - first - 2.0 * inset) / (BLOCK_PX * px_m)), 1)
     size = (last - first - 2.0 * inset) / count
-    reach = min(REACH_PX * px_m, _REACH_OF_HALF_WIDTH * axis.half_width_m)
+    reach = min(REACH_PX * px_m, REACH_MAX * axis.half_width_m)
     return EdgeModel(width_m, reach, first + inset, size, count, axis.half_width_m)
 
 
@@ -177,7 +167,7 @@ def _change_axis(view: PixelSamples, before: Axis, now: Axis) -> PixelSamples:
 
 def _align_axis(rough: Axis, views: list[PixelSamples], px_m: float) -> tuple[Axis, float]:
     """Fit the axis midway between both edges, and the width of the edges."""
-    axis, width_m = rough, _EDGE_PX * px_m
+    axis, width_m = rough, EDGE_FIRST_PX * px_m
     for iteration in range(4):
         model = _place_blocks(axis, width_m, px_m)
         moved = [_change_axis(view, rough, axis) for view in views]
@@ -301,13 +291,13 @@ def fit_base_edge(view: PixelSamples, at_m: float, model: EdgeModel, px_m: float
     """
     along, across, grey = view
     away = np.abs(across) - model.half_width_m
-    of_holder = (away > _HOLDER_FROM_PX * px_m) & (away < _HOLDER_TO_PX * px_m)
+    of_holder = (away > HOLDER_FROM_PX * px_m) & (away < HOLDER_TO_PX * px_m)
     along, across, grey = along[of_holder], across[of_holder], grey[of_holder]
-    rough_m = _END_SEARCH_PX * px_m
+    rough_m = END_SEARCH_PX * px_m
     # From the middle of one side to that of the other.
-    apart_m = 2.0 * model.half_width_m + (_HOLDER_FROM_PX + _HOLDER_TO_PX) * px_m
+    apart_m = 2.0 * model.half_width_m + (HOLDER_FROM_PX + HOLDER_TO_PX) * px_m
     slope, place_m, found = 0.0, 0.0, fit_step(at_m - along, grey, model, rough_m=rough_m)
-    for iteration in range(_ITERATIONS):
+    for iteration in range(HOLDER_STEPS):
         distance = at_m - along - slope * across - place_m
         # After the first iteration it is known where to look.
         left, right = (

@@ -29,16 +29,13 @@ from functools import partial
 
 import numpy as np
 
+from semcal_ros.applications.reconstruction.thresholds import CAUCHY_SIGMAS, DEPTH_PRIOR, SCALE_MIN
 from semcal_ros.applications.reconstruction.types import Observations, tabulate_cameras
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, Step, descend
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
-
-_ROBUST = 2.5  # whitened residuals from which on the loss grows slower (Cauchy's constant)
-_LEAST_SCALE = 1e-6  # least scale of the residuals, for observations without errors
-_POINT_SPREAD = 3.0  # prior 1-sigma of the points' heights, in units of their spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +147,7 @@ class _Problem:
         return np.asarray((z - z[self.reference]) / self.height_sigma, dtype=np.float64)
 
     def depths(self, state: _State) -> Array:
-        return np.asarray(state.points @ self.beam / _POINT_SPREAD, dtype=np.float64)
+        return np.asarray(state.points @ self.beam / DEPTH_PRIOR, dtype=np.float64)
 
     def cost(self, state: _State, sigma: float) -> float:
         white = self.whiten(self.residuals(state)[0]) / sigma
@@ -172,7 +169,7 @@ class _Problem:
         predicted = seen.xy - error
         by_xyz[:, :, 2] = -(rho / w)[:, None] * (predicted - np.stack([px, py], axis=1))
         white = self.whiten(error) / sigma
-        weight = 1.0 / (1.0 + np.sum(white**2, axis=1) / _ROBUST**2)
+        weight = 1.0 / (1.0 + np.sum(white**2, axis=1) / CAUCHY_SIGMAS**2)
         root = seen.root * (np.sqrt(weight) / sigma)[:, None, None]
         rows = root @ by_xyz
         error = np.einsum("nij,nj->ni", root, error)
@@ -189,8 +186,8 @@ class _Problem:
         heights = self.heights(state)
         pose[:, 5, 5] += 1.0 / self.height_sigma**2
         right_pose[:, 5] -= heights / self.height_sigma
-        point += np.outer(self.beam, self.beam) / _POINT_SPREAD**2
-        right_point -= self.depths(state)[:, None] * self.beam / _POINT_SPREAD
+        point += np.outer(self.beam, self.beam) / DEPTH_PRIOR**2
+        right_point -= self.depths(state)[:, None] * self.beam / DEPTH_PRIOR
         return pose, point, coupling.reshape(6 * self.views, -1), right_pose, right_point
 
 
@@ -316,12 +313,12 @@ def _estimate_scale(problem: _Problem, state: _State) -> float:
     spent = 3.0 * len(state.points) + 6.0 * problem.views
     median = float(np.median(np.sum(white**2, axis=1)))
     scale = np.sqrt(median / MEDIAN_CHI2_2 * size / max(size - spent, 0.05 * size))
-    return max(float(scale), _LEAST_SCALE)
+    return max(float(scale), SCALE_MIN)
 
 
 def _compute_loss(white: Array) -> float:
     squared = np.sum(white**2, axis=1)
-    return 0.5 * _ROBUST**2 * float(np.sum(np.log1p(squared / _ROBUST**2)))
+    return 0.5 * CAUCHY_SIGMAS**2 * float(np.sum(np.log1p(squared / CAUCHY_SIGMAS**2)))
 
 
 def _multiply_outer(a: Array, b: Array) -> Array:
@@ -368,7 +365,7 @@ def _finish(
         translations_m=state.translations * unit_m,
         points_m=state.points * unit_m,
         residuals=error,
-        weights=1.0 / (1.0 + np.sum(white**2, axis=1) / _ROBUST**2),
+        weights=1.0 / (1.0 + np.sum(white**2, axis=1) / CAUCHY_SIGMAS**2),
         sigma=sigma,
         cost=problem.cost(state, sigma),
         point_covariance_m2=covariance,

@@ -39,24 +39,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.reconstruction.thresholds import (
+    COSINE2_MIN,
+    LIMB_TERMS,
+    SECOND_DIFFERENCE,
+    SHADING_CONDITION,
+    SHADING_DEGREE,
+    SHADING_NODES,
+    SHADING_OUTLIER,
+)
 from semcal_ros.core.arrays import Array, Image, Indices, mad_sigma
-
-# Second difference along both axes. Its squares sum to 1, so that it keeps the sigma of the noise.
-_KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=np.float32) / 6.0
-# Degree of the polynomial in X and Y of the normal: a cosine and its square, seen from any side, and shadows
-# as wide as a quarter of the ball.
-_DEGREE = 4
-# The limb: with the logarithm of the cosine and its inverse, all powers between them are reached within a per
-# cent up to 70 degrees.
-_LIMB_TERMS = 4
-# Least squared cosine, at 84 degrees: the limb is not steeper than the beam spot lets it be.
-_LEAST_COSINE2 = 0.01
-# A patch whose error is so many times the median shows something else, an edge or the tip.
-_OUTLIER = 2.5
-# Nodes along X and Y: linear interpolation is then right to 1e-4 of the range of the cosine.
-_NODES = 257
-# Directions of the coefficients that the views hardly determine stay zero.
-_CONDITION = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +121,7 @@ def _blur_widely(image: Image, sigma_px: float) -> Image:
 
 def _estimate_noise(grey: Image) -> float:
     """Estimate pixel noise from second differences, free of most texture (Immerkaer 1996)."""
-    rough = cv2.filter2D(grey, cv2.CV_32F, _KERNEL)[1:-1, 1:-1]
+    rough = cv2.filter2D(grey, cv2.CV_32F, SECOND_DIFFERENCE)[1:-1, 1:-1]
     return mad_sigma(rough)
 
 
@@ -168,7 +160,7 @@ def fit_shading(slope: Array, grey: Array, point: Indices) -> Shading:
     point
         (patches,) number of the point.
     """
-    terms = (_DEGREE + 1) * (_DEGREE + 2) // 2 - 1 + _LIMB_TERMS
+    terms = (SHADING_DEGREE + 1) * (SHADING_DEGREE + 2) // 2 - 1 + LIMB_TERMS
     solution = np.zeros(terms)
     if len(point):
         basis = _evaluate_basis(slope)
@@ -180,11 +172,11 @@ def fit_shading(slope: Array, grey: Array, point: Indices) -> Shading:
             right = _subtract_means(value[keep][..., None], point[keep])[..., 0]
             flat = rows.reshape(-1, terms)
             scale = np.sqrt(np.mean(flat**2, axis=0)) + 1e-12
-            found = np.linalg.lstsq(flat / scale, right.ravel(), rcond=_CONDITION)[0]
+            found = np.linalg.lstsq(flat / scale, right.ravel(), rcond=SHADING_CONDITION)[0]
             solution = found / scale
             error = np.sqrt(np.mean((right - rows @ solution) ** 2, axis=1))
-            keep[np.flatnonzero(keep)[error > _OUTLIER * np.median(error)]] = False
-    axis = np.linspace(-1.0, 1.0, _NODES)
+            keep[np.flatnonzero(keep)[error > SHADING_OUTLIER * np.median(error)]] = False
+    axis = np.linspace(-1.0, 1.0, SHADING_NODES)
     nodes = np.stack(np.meshgrid(axis, axis), axis=-1)
     return Shading(np.asarray(_evaluate_basis(nodes) @ solution, dtype=np.float32))
 
@@ -192,9 +184,11 @@ def fit_shading(slope: Array, grey: Array, point: Indices) -> Shading:
 def _evaluate_basis(slope: Array) -> Array:
     """Evaluate (..., terms) functions of the normal's X and Y."""
     x, y = slope[..., 0], slope[..., 1]
-    cosine = np.sqrt(np.maximum(1.0 - x * x - y * y, _LEAST_COSINE2))
+    cosine = np.sqrt(np.maximum(1.0 - x * x - y * y, COSINE2_MIN))
     limb = np.log(cosine)
-    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i) if i + j]
+    powers = [
+        (i, j) for i in range(SHADING_DEGREE + 1) for j in range(SHADING_DEGREE + 1 - i) if i + j
+    ]
     terms = [x**i * y**j for i, j in powers]
     return np.stack([*terms, limb, limb * x, limb * y, 1.0 / cosine], axis=-1)
 

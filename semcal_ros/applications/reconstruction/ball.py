@@ -21,12 +21,14 @@ larger than chance allows. *Shape*: what the points scatter about the sphere bey
 uncertainty. *Scale*: nm per pixel of the calibration, and the height of the ball above or below the
 reference plane, which parallel projection does not show. *Patches*: what shading, blur and foreshortening
 leave in their positions belongs to the look of the ball and is the same in all views, so that neither
-residuals nor the jackknife show it.
+residuals nor leaving out views show it. It differs from place to place, so that leaving out groups of
+neighbouring patches in turn, with the poses adjusted again, does; what that shows beyond the shape is theirs.
+An error that all patches of a ball share is not in the interval: it has been looked for on simulated balls only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,12 +43,9 @@ from semcal_ros.applications.reconstruction.moving_least_squares import (
 from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.roundness import Roundness, measure_roundness
 from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
-
-# The jackknife has few degrees of freedom: a larger scatter than this happens by chance once in 20 times.
-_CHANCE = 0.05
-# 1-sigma of what patches are systematically off at the limb, px: with the true poses, the movement of a ball of
-# 69 px radius is measured 0.08 % too small or too large (standard deviation of 20 textures, `benchmarks.ball`).
-_PATCH_BIAS_PX = 0.056
+from semcal_ros.applications.reconstruction.thresholds import JACKKNIFE_FALSE_ALARMS, PATCH_GROUPS
+from semcal_ros.applications.reconstruction.types import Observations
+from semcal_ros.core.arrays import Array, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +128,20 @@ def measure_ball(
     groups = min(groups, len(structure.cameras) // 4)
     freedom = np.inf
     if groups >= 3:
-        measured = _run_jackknife(structure, sphere, groups)
-        if (measured / noise) ** 2 > float(chdtri(groups - 1, _CHANCE)) / (groups - 1):
+        measured = _leave_out_views(structure, sphere, groups)
+        limit = float(chdtri(groups - 1, JACKKNIFE_FALSE_ALARMS)) / (groups - 1)
+        if (measured / noise) ** 2 > limit:
             noise, freedom = measured, groups - 1.0
     shape = 2.0 * sphere.radius_sigma_m * np.sqrt(sharing * _compute_excess(structure, sphere))
+    among, patch_groups = _leave_out_patches(structure, sphere)
+    patches = float(np.sqrt(max(among**2 - shape**2, 0.0)))
     diameter = 2.0 * sphere.radius_m
     scale = diameter * _compute_scale_sigma(structure, height_sigma_m)
-    pixel_m = float(np.mean([np.mean(camera.pixel_size_m) for camera in structure.cameras]))
-    bias = 2.0 * _PATCH_BIAS_PX * pixel_m
-    total = float(np.hypot.reduce((noise, shape, scale, bias)))
-    # Welch and Satterthwaite: only the jackknife has few degrees of freedom.
-    degrees = freedom * (total / noise) ** 4 if np.isfinite(freedom) else 1e6
-    reach = float(stdtrit(min(degrees, 1e6), 0.5 + 0.5 * confidence)) * total
+    total = float(np.hypot.reduce((noise, shape, scale, patches)))
+    # Welch and Satterthwaite: only what is measured by leaving out has few degrees of freedom.
+    unsure = noise**4 / freedom + (shape**2 + patches**2) ** 2 / (patch_groups - 1.0)
+    degrees = min(total**4 / unsure, 1e6) if unsure > 0.0 else 1e6
+    reach = float(stdtrit(degrees, 0.5 + 0.5 * confidence)) * total
     mesh = _mesh_ball(structure, sphere)
     return Ball(
         sphere=sphere,
@@ -149,7 +150,7 @@ def measure_ball(
         noise_sigma_m=float(noise),
         shape_sigma_m=float(shape),
         scale_sigma_m=scale,
-        patch_bias_sigma_m=bias,
+        patch_bias_sigma_m=patches,
         interval_m=(diameter - reach, diameter + reach),
         groups=groups,
         coverage=_compute_coverage(mesh, sphere),
@@ -171,33 +172,71 @@ def _count_sharing(structure: Structure) -> float:
     return float(np.sum(np.exp(-((pairs["v"] / wide) ** 2))) / len(structure.points_m))
 
 
-def _run_jackknife(structure: Structure, sphere: SphereFit, groups: int) -> float:
+def _leave_out_views(structure: Structure, sphere: SphereFit, groups: int) -> float:
     """Estimate the 1-sigma of the diameter by leaving out each group of views once."""
     done, seen = structure.adjustment, structure.observations
     # Neighbouring views share little but their noise is independent: interleave.
     group = np.arange(len(structure.cameras)) % groups
     group[done.reference] = -1
-    diameters = []
+    everything = np.arange(len(done.points_m))
+    diameters = [
+        _diameter_of(structure, sphere, seen.select(group[seen.view] != left_out), everything)
+        for left_out in range(groups)
+    ]
+    return jackknife_sigma(diameters)
+
+
+def _leave_out_patches(structure: Structure, sphere: SphereFit) -> tuple[float, int]:
+    """Estimate the 1-sigma of the diameter by leaving out each group of neighbouring patches once; and their number."""
     inliers = np.flatnonzero(sphere.inliers)
-    for left_out in range(groups):
-        part = seen.select(group[seen.view] != left_out)
-        fewer = adjust(
-            part,
-            structure.cameras,
-            done.rotations,
-            done.translations_m,
-            done.points_m,
-            reference=done.reference,
-            max_iterations=4,
-            tolerance=1e-5,
-        )
-        still = np.bincount(part.point, minlength=len(done.points_m))[inliers] >= 3
-        use = inliers[still]
-        diameters.append(
-            2.0 * fit_sphere(fewer.points_m[use], structure.normal_sigma_m[use]).radius_m
-        )
-    spread = np.array(diameters) - np.mean(diameters)
-    return float(np.sqrt((groups - 1.0) / groups * np.sum(spread**2)))
+    groups = int(np.clip(len(inliers) // 4, 2, PATCH_GROUPS))
+    seen = structure.observations
+    diameters = []
+    for left_out in split_neighbours(structure.points_m[inliers], groups):
+        keep = np.ones(len(structure.points_m), dtype=bool)
+        keep[inliers[left_out]] = False
+        part = seen.select(keep[seen.point])
+        part = replace(part, point=(np.cumsum(keep) - 1)[part.point])
+        diameters.append(_diameter_of(structure, sphere, part, np.flatnonzero(keep)))
+    return jackknife_sigma(diameters), len(diameters)
+
+
+def split_neighbours(points_m: Array, groups: int) -> list[Indices]:
+    """Divide points into groups of neighbours: the largest group in half along its longest side, again and again."""
+    parts = [np.arange(len(points_m))]
+    while len(parts) < groups:
+        part = parts.pop(int(np.argmax([len(one) for one in parts])))
+        axis = int(np.argmax(np.ptp(points_m[part], axis=0)))
+        part = part[np.argsort(points_m[part, axis], kind="stable")]
+        parts += [part[: len(part) // 2], part[len(part) // 2 :]]
+    return parts
+
+
+def _diameter_of(
+    structure: Structure, sphere: SphereFit, part: Observations, points: Indices
+) -> float:
+    """Return the diameter from some of the observations, of these points of the structure."""
+    done = structure.adjustment
+    fewer = adjust(
+        part,
+        structure.cameras,
+        done.rotations,
+        done.translations_m,
+        done.points_m[points],
+        reference=done.reference,
+        max_iterations=4,
+        tolerance=1e-5,
+    )
+    seen = np.bincount(part.point, minlength=len(points))
+    use = np.flatnonzero(sphere.inliers[points] & (seen >= 3))
+    sigma_m = structure.normal_sigma_m[points]
+    return 2.0 * fit_sphere(fewer.points_m[use], sigma_m[use]).radius_m
+
+
+def jackknife_sigma(values: list[float]) -> float:
+    """Return the 1-sigma of an estimate from its values without one group each (Efron and Stein 1981)."""
+    spread = np.array(values) - np.mean(values)
+    return float(np.sqrt((len(values) - 1.0) / len(values) * np.sum(spread**2)))
 
 
 def _compute_scale_sigma(structure: Structure, height_sigma_m: float) -> float:

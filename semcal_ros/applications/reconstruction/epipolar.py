@@ -26,12 +26,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semcal_ros.applications.reconstruction.thresholds import PAIRS_MIN
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
-
-# Four pairs define the geometry, a fifth one tests it.
-_LEAST_POINTS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +85,7 @@ def fit_epipolar(
     StructureError
         For fewer than five pairs.
     """
-    if len(first) < _LEAST_POINTS:
+    if len(first) < PAIRS_MIN:
         raise StructureError(f"{counted(len(first), 'point')} in two views", expected="at least 5")
     joint = np.hstack([second, first])
     rng = np.random.default_rng(seed)
@@ -104,7 +102,7 @@ def fit_epipolar(
     # Cauchy loss finds the same plane (0.082 degrees off with 20 % wrong pairs), and all of the fit
     # then takes 130 ms instead of 39 ms.
     for _ in range(10):
-        if np.count_nonzero(inliers) < _LEAST_POINTS:
+        if np.count_nonzero(inliers) < PAIRS_MIN:
             break
         normal, offset = _fit_plane(joint[inliers])
         distance = np.abs(joint @ normal + offset)

@@ -27,23 +27,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semcal_ros.applications.reconstruction.thresholds import (
+    BLOCK_VIEWS_MIN,
+    COMMON_MIN,
+    DEPTH_LEVER_MIN,
+    HUBER_SIGMAS,
+    VIEW_POINTS_MIN,
+    WINDOWS,
+)
 from semcal_ros.applications.reconstruction.types import Tracks
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
-
-# Numbers of successive views that are tried as the first block: short ones share more points, long
-# ones turn further.
-_WINDOWS = (3, 4, 6, 8, 12, 16, 24, 32, 48)
-LEAST_COMMON = 12
-"""Points that all views of a block share: four times the rank, so that the other singular values show the noise."""
-# Points in a view: twice the four unknowns of each row of its camera.
-_LEAST_IN_VIEW = 8
-# Two affine views leave the relief open.
-_LEAST_VIEWS = 3
-# Constant of Huber's weights, in sigma: near the 1.345 that is 95 % efficient with normal noise.
-_HUBER = 1.5
-# A new point waits until the squared lever arm of its depth is this part of that across the view.
-_WEAKEST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +92,11 @@ def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
     """Choose views and points of the block with the most relief; also relief over noise."""
     best: tuple[float, Indices, Indices, float] | None = None
     n_views = len(tracks.seen)
-    for length in (w for w in _WINDOWS if w <= max(n_views, _LEAST_VIEWS)):
+    for length in (w for w in WINDOWS if w <= max(n_views, BLOCK_VIEWS_MIN)):
         for first in range(0, n_views - length + 1, max(1, length // 4)):
             views = np.arange(first, first + length)
             points = np.flatnonzero(tracks.seen[views].all(axis=0))
-            if len(points) < LEAST_COMMON:
+            if len(points) < COMMON_MIN:
                 continue
             table = _centre_rows(tracks.xy_m[np.ix_(views, points)])
             values = np.linalg.svd(table, compute_uv=False)
@@ -115,7 +109,7 @@ def _choose_first_block(tracks: Tracks) -> tuple[Indices, Indices, float]:
                 best = (score, views, points, relief)
     if best is None:
         raise StructureError(
-            f"no {_LEAST_VIEWS} of {n_views} views share {LEAST_COMMON} points",
+            f"no {BLOCK_VIEWS_MIN} of {n_views} views share {COMMON_MIN} points",
             expected="a sequence in which points can be followed from view to view",
             do="record slower movements or more texture",
         )
@@ -166,11 +160,11 @@ class _GrowingStructure:
         """Compute (views, points) Huber weights; zero for unused observations."""
         error, used = self._residuals()
         size = np.linalg.norm(error, axis=2) / self.sigma
-        return np.where(used, _HUBER / np.maximum(size, _HUBER), 0.0)
+        return np.where(used, HUBER_SIGMAS / np.maximum(size, HUBER_SIGMAS), 0.0)
 
     def place_views(self, wanted: Mask, weights: Array | None = None) -> None:
         """Fit cameras that see enough placed points by least squares."""
-        able = (self.seen & self.points_in).sum(axis=1) >= _LEAST_IN_VIEW
+        able = (self.seen & self.points_in).sum(axis=1) >= VIEW_POINTS_MIN
         index = np.flatnonzero(wanted & able)
         if not len(index):
             return
@@ -200,7 +194,7 @@ class _GrowingStructure:
     def place_points(self, wanted: Mask) -> None:
         """Fit points that enough placed views see from different sides by least squares."""
         index = np.flatnonzero(
-            wanted & ((self.seen & self.views_in[:, None]).sum(axis=0) >= _LEAST_VIEWS)
+            wanted & ((self.seen & self.views_in[:, None]).sum(axis=0) >= BLOCK_VIEWS_MIN)
         )
         if not len(index):
             return
@@ -213,7 +207,7 @@ class _GrowingStructure:
         normal = np.einsum("vp,vki,vkj->pij", weight, self.cameras, self.cameras, optimize=True)
         right = np.einsum("vp,vki,vpk->pi", weight, self.cameras, shift, optimize=True)
         values = np.linalg.eigvalsh(normal)
-        good = values[:, 0] > _WEAKEST * values[:, 2]
+        good = values[:, 0] > DEPTH_LEVER_MIN * values[:, 2]
         placed = index[good]
         self.points[placed] = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
         self.points_in[placed] = True
@@ -227,7 +221,7 @@ class _GrowingStructure:
             if open_views.any():
                 counts = (self.seen & self.points_in).sum(axis=1) * open_views
                 # Views with the most placed points first: they add points for the others.
-                self.place_views(counts >= max(0.7 * counts.max(), _LEAST_IN_VIEW))
+                self.place_views(counts >= max(0.7 * counts.max(), VIEW_POINTS_MIN))
             self.sigma = self._scale()
             if before == (int(self.views_in.sum()), int(self.points_in.sum())):
                 return

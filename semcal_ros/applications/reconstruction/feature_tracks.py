@@ -35,12 +35,10 @@ from semcal_ros.applications.reconstruction.appearance import (
     prepare_appearance,
 )
 from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
+from semcal_ros.applications.reconstruction.thresholds import FEATURES_MIN
 from semcal_ros.core.arrays import Array, Indices, Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
-
-# With fewer features left than this, the whole frame is processed: the others may be anywhere.
-_FEW = 30
 
 
 @dataclass(frozen=True)
@@ -246,7 +244,7 @@ class SequenceTracker:
         """Return rows and columns around the last features, with room to move and for new ones."""
         reference = self._reference
         everything = (slice(0, camera.height), slice(0, camera.width))
-        if reference is None or np.count_nonzero(reference.alive) < _FEW:
+        if reference is None or np.count_nonzero(reference.alive) < FEATURES_MIN:
             return everything
         raw = _project_from_plane(camera, reference.latest_m[reference.alive])
         return _make_box(raw, camera, self.settings.room_px)[0]

@@ -26,14 +26,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from semcal_ros.applications.reconstruction.thresholds import SURFACE_NEIGHBOURS, SURFACE_POINTS_MIN
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
-
-# Neighbours in a fit, at most: eight for each coefficient of a quadric; bounds time and memory.
-_NEIGHBOURS = 48
-# A quadric has six coefficients; two more show the scatter.
-_LEAST = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +89,10 @@ def fit_local_surface(
     StructureError
         For fewer than eight points.
     """
-    if len(cloud_m) < _LEAST:
+    if len(cloud_m) < SURFACE_POINTS_MIN:
         raise StructureError(
-            f"a cloud of {counted(len(cloud_m), 'point')}", expected=f"at least {_LEAST}"
+            f"a cloud of {counted(len(cloud_m), 'point')}",
+            expected=f"at least {SURFACE_POINTS_MIN}",
         )
     tree = cKDTree(cloud_m)
     at = np.array(at_m, dtype=np.float64)
@@ -106,9 +103,9 @@ def fit_local_surface(
 
 
 def _fit_quadrics(cloud: Array, tree: cKDTree, at: Array, radius: float) -> LocalSurface:
-    count = min(_NEIGHBOURS, len(cloud))
+    count = min(SURFACE_NEIGHBOURS, len(cloud))
     distance, index = tree.query(at, k=count)
-    wide = np.maximum(radius, distance[:, min(_LEAST, count) - 1])[:, None]
+    wide = np.maximum(radius, distance[:, min(SURFACE_POINTS_MIN, count) - 1])[:, None]
     weight = np.exp(-((distance / wide) ** 2))
     near = cloud[index]
     total = weight.sum(axis=1)

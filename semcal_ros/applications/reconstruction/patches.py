@@ -33,20 +33,18 @@ import numpy as np
 
 from semcal_ros.applications.reconstruction.appearance import Shading, fit_shading
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, project_to_plane
+from semcal_ros.applications.reconstruction.thresholds import (
+    PATCH_GAIN_MIN,
+    POINTS_AT_ONCE,
+    SHADING_POINTS,
+    WINDOW,
+)
 from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
 
 #: As :func:`itertools.starmap`.
 Starmap = Callable[[Callable[..., Any], Iterable[Sequence[Any]]], Iterator[Any]]
-WINDOW = 0.6  # sigma of the window in which patches are compared, in half patches
-# Least contrast of a patch over that of the template. It keeps the division bounded for patches
-# that are hardly like the template; ``least_correlation`` rejects most of them afterwards.
-_GAIN_LEAST = 0.3
-# Points from which the shading is learnt: some 60 000 samples for 18 coefficients.
-_SHADING_POINTS = 100
-# Points whose patches are compared together: of 150 views some 9 MB, a fraction of a second.
-_POINTS_AT_ONCE = 64
 
 
 def compute_displacement_m(
@@ -280,7 +278,7 @@ def _measure_shading(cuts: Sequence[_Cut], patches: Image, seen: Mask, half: int
     pick = np.arange(side * side).reshape(side, side)[1::3, 1::3].ravel()
     grid = _make_patch_grid(half)[pick]
     points = np.flatnonzero(seen.sum(axis=0) >= 3)
-    points = points[:: max(1, len(points) // _SHADING_POINTS)]
+    points = points[:: max(1, len(points) // SHADING_POINTS)]
     slopes, greys, names = [], [], []
     for view, cut in enumerate(cuts):
         chosen = np.flatnonzero(np.isin(cut.points, points) & seen[view, cut.points])
@@ -300,7 +298,7 @@ class _Matched:
 
 def _match_patches(patches: Image, seen: Mask, half: int, starmap: Starmap) -> _Matched:
     """Measure the shift of every patch (views, points) against the mean of the others, patch px."""
-    parts = [slice(k, k + _POINTS_AT_ONCE) for k in range(0, patches.shape[1], _POINTS_AT_ONCE)]
+    parts = [slice(k, k + POINTS_AT_ONCE) for k in range(0, patches.shape[1], POINTS_AT_ONCE)]
     matched = list(starmap(match_points, ((patches[:, p], seen[:, p], half) for p in parts)))
     return _Matched(*(np.concatenate(arrays, axis=1) for arrays in zip(*matched, strict=True)))
 
@@ -329,7 +327,7 @@ def match_points(patches: Image, seen: Mask, half: int) -> tuple[Array, Array, A
         inverse = np.linalg.inv(normal)
         power = np.sum(window * others**2, axis=1)
         both = np.sum(window * others * stack, axis=1)
-        gain = np.maximum(both / power, _GAIN_LEAST)
+        gain = np.maximum(both / power, PATCH_GAIN_MIN)
         error = stack / gain[:, None] - others
         shift[at, point] = -(error * window) @ slope @ inverse
         fitted = error + shift[at, point] @ slope.T

@@ -37,23 +37,19 @@ from semcal_ros.applications.reconstruction.moving_least_squares import (
     fit_local_surface,
 )
 from semcal_ros.applications.reconstruction.patches import (
-    WINDOW,
     PatchSettings,
     PosedSurface,
     Starmap,
     measure_patches,
     project_to_plane_at_centre,
 )
+from semcal_ros.applications.reconstruction.thresholds import POINT_MISFIT_MAX, WINDOW
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
-
-# Mean square of a point's residuals over that of the median point. Of points that turn with a ball, 99 of 100
-# are below 2; of those on the outline of its tip, most are above.
-_LARGEST_MISFIT = 2.0
 
 
 @dataclass(frozen=True)
@@ -324,7 +320,7 @@ class _Refinement:
         square = np.bincount(self.seen.point, np.sum(white**2, axis=1), len(self.points))
         mean = square / np.maximum(count, 1)
         usual = np.median(mean[count > 0])
-        return np.asarray(mean <= _LARGEST_MISFIT * usual, dtype=bool)
+        return np.asarray(mean <= POINT_MISFIT_MAX * usual, dtype=bool)
 
     def _measure_change_in_sigma(self, before: Array, normals: Array, covariance: Array) -> float:
         """Return the RMS change along the normals over the RMS 1-sigma there, after a rigid alignment."""

@@ -30,27 +30,17 @@ from scipy.special import chdtrc, ndtr
 
 from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.sphere import SphereFit
-from semcal_ros.core.arrays import Array, Mask, mad_sigma
-
-# Points further off than this part of the radius belong to something else: what holds the ball.
-_FAR = 0.2
-# Angle about such points within which others are left out: the neck of the tip, rad.
-_NECK_RAD = 0.35
-# 1-sigma of a window, rad. A bump as wide as the window shows most clearly; windows narrower than a patch, or
-# with only a few points in them, show noise.
-_WINDOW_RAD = 0.2
-# Points that a window holds at least, by weight.
-_LEAST_IN_WINDOW = 5.0
-# Probability with which a true ball is said to be none, over both searches.
-_FALSE_ALARM = 0.005
-# Residuals beyond this many robust sigma of their surroundings count as this many (Huber).
-_HUBER = 2.5
-# Constant of Tukey's biweight for 95 % efficiency with normal noise (Holland and Welsch 1977,
-# doi:10.1080/03610927708827533), and rounds of either loss.
-_TUKEY = 4.685
-_ROUNDS = 10
-# Keeps a division from zero where a point alone decides a fit.
-_LEAST_FREEDOM = 1e-3
+from semcal_ros.applications.reconstruction.thresholds import (
+    BUMP_POINTS_MIN,
+    BUMP_RAD,
+    FREEDOM_MIN,
+    HEIGHT_SIGMAS,
+    NECK_RAD,
+    OFF_SPHERE,
+    ROBUST_ROUNDS,
+    ROUNDNESS_FALSE_ALARMS,
+)
+from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, Mask, mad_sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +96,7 @@ def measure_roundness(structure: Structure, sphere: SphereFit, sharing: float) -
     probability = min(1.0, 2.0 * best[0])
     view = structure.adjustment.rotations[structure.adjustment.reference]
     return Roundness(
-        probability > _FALSE_ALARM,
+        probability > ROUNDNESS_FALSE_ALARMS,
         probability,
         kind,
         best[1],
@@ -118,10 +108,10 @@ def measure_roundness(structure: Structure, sphere: SphereFit, sharing: float) -
 
 def _find_body(outward: Array, height: Array) -> Mask:
     """Find the points of the body without what holds it."""
-    far = height > _FAR
-    on = np.abs(height) <= _FAR
+    far = height > OFF_SPHERE
+    on = np.abs(height) <= OFF_SPHERE
     if far.any():
-        on &= (outward @ outward[far].T).max(axis=1) < np.cos(_NECK_RAD)
+        on &= (outward @ outward[far].T).max(axis=1) < np.cos(NECK_RAD)
     return np.asarray(on, dtype=bool)
 
 
@@ -162,20 +152,20 @@ class _SphereResiduals:
         quadric so far that it leaves little residual itself.
         """
         weight = np.ones(len(self.height))
-        for turn in range(2 * _ROUNDS):
-            if turn > _ROUNDS and np.count_nonzero(weight) < 2 * design.shape[1]:
+        for turn in range(2 * ROBUST_ROUNDS):
+            if turn > ROBUST_ROUNDS and np.count_nonzero(weight) < 2 * design.shape[1]:
                 break
             rows = np.linalg.solve((design * weight[:, None]).T @ design, design.T * weight)
             leverage = np.einsum("nk,kn->n", design, rows)
             error = np.abs(self.height - design @ (rows @ self.height))
-            error /= np.maximum(1.0 - leverage, _LEAST_FREEDOM)
+            error /= np.maximum(1.0 - leverage, FREEDOM_MIN)
             scale = max(mad_sigma(error), 1e-15)
-            if turn < _ROUNDS:
-                limit = _HUBER * scale
+            if turn < ROBUST_ROUNDS:
+                limit = HEIGHT_SIGMAS * scale
                 weight = limit / np.maximum(error, limit)
             else:
                 # What is far off by then counts for nothing.
-                limit = _TUKEY * scale
+                limit = TUKEY_CONSTANT * scale
                 weight = np.maximum(1.0 - (error / limit) ** 2, 0.0) ** 2
         solution = np.asarray(rows @ self.height, dtype=np.float64)
         return solution, np.asarray(rows, dtype=np.float64)
@@ -200,10 +190,10 @@ class _SphereResiduals:
 
     def find_bump(self) -> tuple[float, float, float, Array]:
         """Probability, height, its 1-sigma and place of the most significant window."""
-        centres = _thin(self.out, _WINDOW_RAD)
+        centres = _thin(self.out, BUMP_RAD)
         squared = 2.0 - 2.0 * self.out[centres] @ self.out.T
-        weight = np.exp(-0.5 * squared / _WINDOW_RAD**2)
-        full = weight.sum(axis=1) >= _LEAST_IN_WINDOW
+        weight = np.exp(-0.5 * squared / BUMP_RAD**2)
+        full = weight.sum(axis=1) >= BUMP_POINTS_MIN
         if not full.any():
             return 1.0, 0.0, 0.0, self.out[0]
         centres, weight = centres[full], weight[full]
@@ -238,10 +228,10 @@ class _SphereResiduals:
 
         # The mean in a window as wide as the bump is half of its height. It lies where the window found it,
         # up to its width, and is no narrower than half of the window and no wider than a radian.
-        first = np.array([0.0, 0.0, np.log(_WINDOW_RAD), 2.0 * mean / unit, 0.0, 0.0, 0.0, 0.0])
-        reach = np.array([_WINDOW_RAD, _WINDOW_RAD, np.inf, np.inf, np.inf, np.inf, np.inf, np.inf])
+        first = np.array([0.0, 0.0, np.log(BUMP_RAD), 2.0 * mean / unit, 0.0, 0.0, 0.0, 0.0])
+        reach = np.array([BUMP_RAD, BUMP_RAD, np.inf, np.inf, np.inf, np.inf, np.inf, np.inf])
         low, high = first - reach, first + reach
-        low[2], high[2] = np.log(0.5 * _WINDOW_RAD), 0.0
+        low[2], high[2] = np.log(0.5 * BUMP_RAD), 0.0
         found = least_squares(error, first, bounds=(low, high), loss="soft_l1").x
         towards, form = bump(found)
         design = np.column_stack([self.frame, form])
@@ -252,7 +242,7 @@ class _SphereResiduals:
     def _clip(self, weight: Array) -> Array:
         near = weight > np.exp(-2.0)
         middle = float(np.median(self.height[near]))
-        limit = _HUBER * max(mad_sigma(self.height[near]), np.sqrt(self.rough), 1e-15)
+        limit = HEIGHT_SIGMAS * max(mad_sigma(self.height[near]), np.sqrt(self.rough), 1e-15)
         return np.asarray(np.clip(self.height, middle - limit, middle + limit))
 
 

@@ -20,15 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semcal_ros.applications.reconstruction.thresholds import SPHERE_POINTS_MIN, SPHERE_TRIALS
 from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
-
-# Random samples of four points. If only a third of the points is on the sphere, one sample in 81 is
-# good, and all 500 are bad with a probability of 0.2 %.
-_TRIALS = 500
-# Twice the four unknowns of a sphere.
-_LEAST = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +86,10 @@ def fit_sphere(
     StructureError
         If fewer than eight points lie on one sphere.
     """
-    if len(points_m) < _LEAST:
+    if len(points_m) < SPHERE_POINTS_MIN:
         raise StructureError(
-            f"a cloud of {counted(len(points_m), 'point')}", expected=f"at least {_LEAST}"
+            f"a cloud of {counted(len(points_m), 'point')}",
+            expected=f"at least {SPHERE_POINTS_MIN}",
         )
     middle = np.median(points_m, axis=0)
     unit = float(np.median(np.linalg.norm(points_m - middle, axis=1)))
@@ -113,10 +109,10 @@ def fit_sphere(
         sigma = mad_sigma(distance[inliers])
         limit = min(max(4.0 * sigma, 1e-9), tolerance)
         chosen = np.abs(distance) <= limit
-        if np.count_nonzero(chosen) < _LEAST:
+        if np.count_nonzero(chosen) < SPHERE_POINTS_MIN:
             raise StructureError(
                 f"{counted(np.count_nonzero(chosen), 'point')} on one sphere",
-                expected=f"at least {_LEAST}",
+                expected=f"at least {SPHERE_POINTS_MIN}",
             )
         same = np.array_equal(chosen, inliers)
         inliers = chosen
@@ -137,7 +133,7 @@ def _compute_weights(sigma: Array) -> Array:
 def _search_sphere(points: Array, tolerance: float, seed: int) -> tuple[Array, float, Mask]:
     """Find the sphere through four points that most others agree with; also its inliers."""
     rng = np.random.default_rng(seed)
-    samples = np.argsort(rng.random((_TRIALS, len(points))), axis=1)[:, :4]
+    samples = np.argsort(rng.random((SPHERE_TRIALS, len(points))), axis=1)[:, :4]
     four = points[samples]
     rows = 2.0 * (four[:, 1:] - four[:, :1])
     right = np.sum(four[:, 1:] ** 2, axis=2) - np.sum(four[:, :1] ** 2, axis=2)

@@ -31,46 +31,27 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
+from semcal_ros.applications.reconstruction.thresholds import (
+    DESCRIPTOR_RATIO,
+    DISPARITY_AGREEMENT_PX,
+    GREY_CORRELATION_MIN,
+    GREY_WINDOW_PX,
+    KEPT_NOISE,
+    MATCH_NEIGHBOURS,
+    MATCH_STEPS,
+    MATCH_TOLERANCE_PX,
+    MATCHES_MIN,
+    MATCHES_PART_MIN,
+    NEIGHBOUR_SIGMAS,
+    NOISE_GAIN,
+    OVERLAP_MATCHES,
+    OVERLAP_MIN,
+    PARALLAX_MAX,
+    PARALLAX_MIN,
+)
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
-
-# Ratio of the distances of the best and the second best descriptor (Lowe 2004, section 7.1).
-_RATIO = 0.8
-# Three times the 0.7 px that a SIFT feature of a coarser octave is uncertain by.
-_TOLERANCE_PX = 2.0
-# A match is compared with so many around it: enough for a median that one wrong match among them does not move.
-_NEIGHBOURS = 8
-# Robust sigmas by which it may be shifted against them: relief is steeper in places than its spread tells.
-_NEIGHBOUR_SIGMAS = 6.0
-# Fewer verified matches leave the axis to a handful of places of the specimen.
-_LEAST_INLIERS = 20
-# Share of the picture that the other must show. With less, the axis comes from a strip along one edge: at a tenth it
-# was seen to be off by three of its sigmas, at a quarter not.
-_LEAST_OVERLAP = 0.2
-# Matches from which an overlap is computed: an affine map needs three.
-_OVERLAP_MATCHES = 5
-# RMS parallax over the width of the picture, beyond which matches are taken for wrong ones: relief of a tenth of the
-# field at 30 degrees makes a twentieth.
-_LARGEST_PARALLAX = 0.05
-# A pair of pictures of which less agrees is not described by one parallel projection.
-_LEAST_INLIER_SHARE = 0.25
-# The parallax must exceed the noise of the matches by this factor, or the axis is a fit of noise.
-_LEAST_PARALLAX = 2.0
-# 1-sigma of the window in which grey levels are compared, px.
-_WINDOW_PX = 2.5
-# Steps of the refinement, each of which gives back what the window smoothed away.
-_STEPS = 3
-# Variance after three steps over that of one: the integral of |1 - (1 - B)^3|^2 over that of B^2, for the transfer
-# function B of a Gaussian in the plane.
-_NOISE_GAIN = 2.0 * (9 / 2 - 18 / 3 + 15 / 4 - 6 / 5 + 1 / 6)
-# Mean variance of white noise after the interpolations: that of OpenCV's cubic kernel is 6/7 per direction. The first
-# picture is resampled along both, the second once more along rows. The shift depends on slow noise, which is kept.
-_KEPT_NOISE = 0.5 * ((6 / 7) ** 2 + (6 / 7) ** 3)
-# Least correlation of the grey levels that are compared: half of their variance is common.
-_LEAST_CORRELATION = 0.7
-# Largest difference of the disparities found from either side, px: the step of the search.
-_LEAST_AGREEMENT_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,18 +116,18 @@ def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: floa
         If too few matches agree, they show no parallax, or the pictures have too little in common.
     """
     one, two = _match_features(first, second)
-    if _OVERLAP_MATCHES <= len(one) < _LEAST_INLIERS:
+    if OVERLAP_MATCHES <= len(one) < MATCHES_MIN:
         _check_overlap(one, two, first, second)
-    if len(one) < _LEAST_INLIERS:
+    if len(one) < MATCHES_MIN:
         raise _refuse_matches(f"only {counted(len(one), 'match', 'matches')}")
     centre, second_centre = _centre_of(first), _centre_of(second)
-    found = fit_epipolar(one - centre, two - second_centre, _TOLERANCE_PX, trials=2000)
+    found = fit_epipolar(one - centre, two - second_centre, MATCH_TOLERANCE_PX, trials=2000)
     kept = found.inliers.copy()
     kept[kept] = _agree_with_neighbours(one[kept], two[kept])
-    if np.count_nonzero(kept) >= _LEAST_INLIER_SHARE * len(one):
+    if np.count_nonzero(kept) >= MATCHES_PART_MIN * len(one):
         _check_overlap(one[kept], two[kept], first, second)
     count = int(np.count_nonzero(kept))
-    if count < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * len(one)):
+    if count < max(MATCHES_MIN, MATCHES_PART_MIN * len(one)):
         raise _refuse_matches(
             f"only {count} of {counted(len(one), 'match', 'matches')} agree with a tilt"
         )
@@ -156,7 +137,7 @@ def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: floa
     # Of one picture twice, rounding makes them zero or less.
     values = np.maximum(values, 1e-12 * values[-1])
     noise = values[0] / (count - 4)
-    if np.sqrt(values[1] / values[0]) < _LEAST_PARALLAX:
+    if np.sqrt(values[1] / values[0]) < PARALLAX_MIN:
         raise StructureError(
             f"the pictures show no parallax: {count} matches fit a flat specimen within "
             f"{np.sqrt(values[1] / count):.2f} px",
@@ -253,7 +234,7 @@ def _centre_of(image: AnyImage) -> Array:
 def _refuse_matches(seen: str) -> StructureError:
     return StructureError(
         f"{seen} between two pictures",
-        expected=f"at least {_LEAST_INLIERS} that agree, from pictures that overlap and look alike",
+        expected=f"at least {MATCHES_MIN} that agree, from pictures that overlap and look alike",
         do="tilt by less between pictures, keep detector and contrast, and avoid charging",
     )
 
@@ -278,7 +259,7 @@ def _match_features(first: AnyImage, second: AnyImage) -> tuple[Array, Array]:
     good = [
         m
         for m, rival in forward
-        if m.distance < _RATIO * rival.distance and back[m.trainIdx] == m.queryIdx
+        if m.distance < DESCRIPTOR_RATIO * rival.distance and back[m.trainIdx] == m.queryIdx
     ]
     pairs = np.array([[*points[m.queryIdx].pt, *others[m.trainIdx].pt] for m in good])
     pairs = np.unique(pairs.reshape(-1, 4), axis=0)
@@ -291,13 +272,13 @@ def _agree_with_neighbours(first: Array, second: Array) -> Mask:
     A wrong match that happens to lie on its epipolar line passes every test of the epipolar geometry. One of them,
     shifted by a hundred px where relief shifts by one, outweighs a thousand right ones in the direction of the axis.
     """
-    if len(first) <= _NEIGHBOURS:
+    if len(first) <= MATCH_NEIGHBOURS:
         return np.ones(len(first), dtype=np.bool_)
     shifts = second - first
-    around = cKDTree(first).query(first, _NEIGHBOURS + 1)[1][:, 1:]
+    around = cKDTree(first).query(first, MATCH_NEIGHBOURS + 1)[1][:, 1:]
     apart = shifts - np.median(shifts[around], axis=1)
     spread = max(mad_sigma(apart[:, 0]), mad_sigma(apart[:, 1]))
-    limit = max(_TOLERANCE_PX, _NEIGHBOUR_SIGMAS * spread)
+    limit = max(MATCH_TOLERANCE_PX, NEIGHBOUR_SIGMAS * spread)
     return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) < limit)
 
 
@@ -308,18 +289,18 @@ def _check_overlap(first: Array, second: Array, image: AnyImage, other: AnyImage
     residual = second - design @ matrix
     extent = np.array(image.shape[1::-1], dtype=np.float64)
     # Wrong matches, or too few places for an affine map, tell no overlap.
-    if rank < 3 or np.max(np.std(residual, axis=0) / extent) > _LARGEST_PARALLAX:
+    if rank < 3 or np.max(np.std(residual, axis=0) / extent) > PARALLAX_MAX:
         return
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     seen = np.column_stack([unit * extent, np.ones(4)]) @ matrix
     frame = unit * np.array(other.shape[1::-1], dtype=np.float64)
     area = cv2.intersectConvexConvex(seen.astype(np.float32), frame.astype(np.float32))[0]
     share = float(area) / abs(float(np.linalg.det(matrix[:2]))) / float(np.prod(extent))
-    if share < _LEAST_OVERLAP:
+    if share < OVERLAP_MIN:
         x, y = seen.mean(axis=0) - frame.mean(axis=0)
         raise StructureError(
             f"the pictures share {share:.0%} of their field: the second is shifted by {x:+.0f}, {y:+.0f} px",
-            expected=f"at least {_LEAST_OVERLAP:.0%} in common",
+            expected=f"at least {OVERLAP_MIN:.0%} in common",
             do="bring the same place back to the middle after tilting, or record at a lower magnification",
         )
 
@@ -366,7 +347,8 @@ def _resample(
 
 def _blur(image: Array | Image) -> Image:
     return np.asarray(
-        cv2.GaussianBlur(np.asarray(image, dtype=np.float32), (0, 0), _WINDOW_PX), dtype=np.float32
+        cv2.GaussianBlur(np.asarray(image, dtype=np.float32), (0, 0), GREY_WINDOW_PX),
+        dtype=np.float32,
     )
 
 
@@ -407,7 +389,7 @@ def _search(
     target = columns + np.nan_to_num(np.round(forward)).astype(int)
     inside = (target >= 0) & (target < forward.shape[1]) & np.isfinite(forward)
     target = np.clip(target, 0, forward.shape[1] - 1)
-    agrees = np.abs(forward + back[rows, target]) <= _LEAST_AGREEMENT_PX
+    agrees = np.abs(forward + back[rows, target]) <= DISPARITY_AGREEMENT_PX
     valid = inside & agrees & left_seen & right_seen[rows, target]
     return forward, valid
 
@@ -442,20 +424,20 @@ def _refine(
         )
         return np.asarray(centred - gain * other, np.float32), np.asarray(slope, np.float32)
 
-    for _ in range(_STEPS):
+    for _ in range(MATCH_STEPS):
         residual, slope = compare()
         change = _blur(slope * residual) / np.maximum(_blur(slope**2), 1e-6)
         disparity = disparity + np.clip(change, -1.0, 1.0)
     residual, slope = compare()
     # Two free values of brightness and contrast, and the shift, over the 4 pi sigma^2 px of the window.
-    cells = 4.0 * np.pi * _WINDOW_PX**2
-    noise = _blur(residual**2) * (cells / (cells - 3.0)) / _KEPT_NOISE
+    cells = 4.0 * np.pi * GREY_WINDOW_PX**2
+    noise = _blur(residual**2) * (cells / (cells - 3.0)) / KEPT_NOISE
     information = _blur(slope**2)
-    narrow = cv2.GaussianBlur(slope**2, (0, 0), _WINDOW_PX / np.sqrt(2.0))
+    narrow = cv2.GaussianBlur(slope**2, (0, 0), GREY_WINDOW_PX / np.sqrt(2.0))
     # sum w^2 g^2 / (sum w g^2)^2, where w^2 is a Gaussian narrower by sqrt(2) and lower by the size of the window.
-    sigma = np.sqrt(_NOISE_GAIN * noise * narrow / cells) / np.maximum(information, 1e-12)
+    sigma = np.sqrt(NOISE_GAIN * noise * narrow / cells) / np.maximum(information, 1e-12)
     rough = disparity.copy()
-    for _ in range(_STEPS):
+    for _ in range(MATCH_STEPS):
         rough = rough - _blur(rough)
     # What the steps have not given back yet, as far as it shows.
     sigma = np.sqrt(sigma**2 + _blur(rough**2))
@@ -464,10 +446,10 @@ def _refine(
     good = (
         valid
         & known
-        & (correlation > _LEAST_CORRELATION)
+        & (correlation > GREY_CORRELATION_MIN)
         & right_seen[rows.astype(int), target]
         # A step of more than this was beyond the reach of the least squares.
         & (np.abs(disparity - start) < 2.0)
-        & (sigma < _LEAST_AGREEMENT_PX)
+        & (sigma < DISPARITY_AGREEMENT_PX)
     )
     return np.where(good, disparity, np.nan), np.where(good, sigma, np.nan)

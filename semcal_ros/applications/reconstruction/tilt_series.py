@@ -25,6 +25,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semcal_ros.applications.reconstruction.thresholds import (
+    AXIS_DOUBT_RAD,
+    CONTRADICTION_SIGMAS,
+    COVERAGE_MIN,
+    TILT_STEP_MAX_RAD,
+    TILT_STEP_MIN_RAD,
+)
 from semcal_ros.applications.reconstruction.tilt_pair import (
     TiltGeometry,
     find_tilt_geometry,
@@ -32,17 +39,6 @@ from semcal_ros.applications.reconstruction.tilt_pair import (
 )
 from semcal_ros.core.arrays import AnyImage, Array, check_positive, mad_sigma
 from semcal_ros.core.errors import InvalidValueError, StructureError
-
-# Least tilt between two pictures: at 0.5 degrees an error of 0.1 px is one of 11 px in height.
-_LEAST_TILT_RAD = np.radians(0.5)
-# Largest one: beyond it, pictures of rough surfaces hide too much of each other.
-_LARGEST_TILT_RAD = np.radians(45.0)
-# An axis farther from the expected one could be the expected one in either sense.
-_AXIS_DOUBT_RAD = np.radians(45.0)
-# Share of the picture that must have a height, or the map says nothing about the specimen.
-_LEAST_COVERAGE = 0.02
-# Heights of two pairs that differ by more sigmas are wrong matches.
-_CONTRADICTION = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,19 +219,19 @@ def _check_tilts(ascending: Array) -> None:
     steps = np.diff(ascending)
     if (
         not np.all(np.isfinite(ascending))
-        or np.any(steps < _LEAST_TILT_RAD)
-        or (np.any(steps > _LARGEST_TILT_RAD))
+        or np.any(steps < TILT_STEP_MIN_RAD)
+        or (np.any(steps > TILT_STEP_MAX_RAD))
     ):
         shown = ", ".join(f"{np.degrees(tilt):g}" for tilt in ascending)
         raise InvalidValueError(
             f"tilts of {shown} degrees",
-            expected=f"steps of {np.degrees(_LEAST_TILT_RAD):g} to {np.degrees(_LARGEST_TILT_RAD):g} degrees",
+            expected=f"steps of {np.degrees(TILT_STEP_MIN_RAD):g} to {np.degrees(TILT_STEP_MAX_RAD):g} degrees",
             do="state what each picture was tilted by, as in --tilts 0deg,6deg,12deg",
         )
 
 
 def _check_axis(pair: TiltGeometry, expected_rad: float) -> None:
-    if abs(pair.axis_rad - expected_rad) > _AXIS_DOUBT_RAD:
+    if abs(pair.axis_rad - expected_rad) > AXIS_DOUBT_RAD:
         one = np.degrees(np.angle(np.exp(1j * pair.axis_rad)))
         other = one - 180.0 * np.sign(one)
         raise StructureError(
@@ -247,10 +243,10 @@ def _check_axis(pair: TiltGeometry, expected_rad: float) -> None:
 
 def _check_coverage(height: Array) -> None:
     share = float(np.mean(np.isfinite(height)))
-    if share < _LEAST_COVERAGE:
+    if share < COVERAGE_MIN:
         raise StructureError(
             f"only {share:.1%} of the picture has a height",
-            expected=f"at least {_LEAST_COVERAGE:.0%}, from pictures that overlap and show texture",
+            expected=f"at least {COVERAGE_MIN:.0%}, from pictures that overlap and show texture",
             do="tilt by less between pictures, or record with less noise",
         )
 
@@ -309,7 +305,7 @@ def _combine(
     # Where the pairs differ by more than their noise allows, the noise is what they differ by.
     growth = max(1.0, mad_sigma(score[both] - np.median(score[both])))
     s, t, expected = s * growth, t * growth, expected * growth
-    wrong = both & (np.abs(two - one) > _CONTRADICTION * expected)
+    wrong = both & (np.abs(two - one) > CONTRADICTION_SIGMAS * expected)
     weight = (t**2 - common * s * t) / expected**2
     weight = np.where(both, weight, np.isfinite(one).astype(np.float64))
     first, second = np.nan_to_num(one), np.nan_to_num(two)

@@ -26,13 +26,8 @@ from __future__ import annotations
 import numpy as np
 
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
+from semcal_ros.applications.servoing.thresholds import SAME_SCALE, SCALE_SIGMA
 from semcal_ros.core.arrays import Array
-
-# Scales that differ by less than this are of one magnification: if the cameras still differ,
-# another calibration has come into force.
-_SAME_SCALE = 0.002
-# Relative error of the scale of a camera (1-sigma): it also moves points that are off the axis.
-_SCALE_SIGMA = 0.003
 
 
 class AxisObserver:
@@ -92,12 +87,12 @@ class AxisObserver:
             return False
         m_from_px = [np.linalg.inv(camera.jacobian(place_m[None])[0]) for camera in (before, after)]
         scale = np.sqrt(abs(np.linalg.det(m_from_px[0]) / np.linalg.det(m_from_px[1])))
-        if abs(float(scale) - 1.0) < _SAME_SCALE:
+        if abs(float(scale) - 1.0) < SAME_SCALE:
             self.restart()
             return False
         slope = m_from_px[1] - m_from_px[0]
         self.covariance = self.covariance + self._change * np.eye(2)
-        noise = covariance_m2 + (_SCALE_SIGMA * float(np.hypot(*place_m))) ** 2 * np.eye(2)
+        noise = covariance_m2 + (SCALE_SIGMA * float(np.hypot(*place_m))) ** 2 * np.eye(2)
         spread = slope @ self.covariance @ slope.T + noise
         gain = np.linalg.solve(spread, slope @ self.covariance).T
         self.offset_px = self.offset_px + gain @ surprise_m

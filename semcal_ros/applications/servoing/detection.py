@@ -34,35 +34,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.applications.servoing.target import NestedTarget, dictionary
+from semcal_ros.applications.servoing.thresholds import (
+    CONTRAST_MIN,
+    PLACES_MAX,
+    PLACES_MIN,
+    RAGGED_PART,
+    SEARCH_BLUR_PX,
+    SEARCHED_PX,
+    SETTLED_PX,
+    SIDE_ENDS,
+    SIDE_MIN_PX,
+    STEP_SIGMAS,
+    WINDOW,
+    WINDOW_MAX_PX,
+    WINDOW_MIN_PX,
+    WINDOW_ROUNDS,
+)
 from semcal_ros.core.arrays import Array, Image, Mask, check_image
-
-# Larger images are averaged down by a whole factor to find the markers; their sides are then
-# measured at full resolution.
-_SEARCHED_PX = 1024
-# Three pixels for each of the six squares along a side.
-_SMALLEST_SIDE_PX = 18.0
-# Sigma of the smoothing for the search: a third of the smallest square that can be read.
-_NOISE_BLUR_PX = 1.0
-# Part of a side that is left out at each end, where the window would meet the next side.
-_ENDS = 0.14
-# Half-width of the window as a part of the side, and its limits, px. Border and frame of a marker
-# are wider.
-_WINDOW, _NARROWEST_PX, _WIDEST_PX = 0.11, 2.0, 6.0
-# The windows are laid over the corners found last, at most this often.
-_ROUNDS = 4
-# Movement of the corners after which that ends: what they are uncertain by at best.
-_CONVERGED_PX = 0.02
-# Largest number of places along a side at which its step is measured: more of them cost time, and
-# neighbours that are closer than a pixel share their noise.
-_MOST_PLACES = 96
-# Steps further than this many sigma from the line through the others are dust.
-_OUTLIER = 3.5
-# Steps that scatter by more than this part of the window do not form a line.
-_RAGGED = 0.5
-# Least contrast of a side, in standard deviations of its pixels from the two levels.
-_LEAST_CONTRAST = 2.0
-# The least number of places on a side, also after outliers were left out: three per unknown.
-_LEAST_PLACES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +120,7 @@ def find_target(image: ArrayLike, target: NestedTarget) -> TargetView:
     pixels = np.ascontiguousarray(grey, dtype=np.float32)
     if not np.all(np.isfinite(pixels)):
         return _reject("the image has values that are not finite")
-    factor = -(-max(pixels.shape) // _SEARCHED_PX)
+    factor = -(-max(pixels.shape) // SEARCHED_PX)
     stretched = _stretch(pixels, factor)
     if stretched is None:
         return _reject("image: blank")
@@ -165,7 +153,7 @@ def _stretch(image: NDArray[np.float32], factor: int) -> NDArray[np.uint8] | Non
         height, width = (side // factor for side in image.shape)
         cut = image[: height * factor, : width * factor]
         small = cut.reshape(height, factor, width, factor).mean(axis=(1, 3), dtype=np.float32)
-    smooth = cv2.GaussianBlur(small, (0, 0), _NOISE_BLUR_PX)
+    smooth = cv2.GaussianBlur(small, (0, 0), SEARCH_BLUR_PX)
     # Pixels that were not scanned are 0 in a rectified image and say nothing about the contrast.
     seen = smooth[smooth > 0.0]
     if seen.size < 1024:
@@ -202,7 +190,7 @@ def _search_markers(
     # The same marker twice: one of them is something else, and nothing shows which.
     seen, count = np.unique(ids, return_counts=True)
     keep = (ids < target.size) & np.isin(ids, seen[count == 1])
-    keep &= sides.min(axis=1) >= _SMALLEST_SIDE_PX
+    keep &= sides.min(axis=1) >= SIDE_MIN_PX
     return ids[keep], (corners[keep] + 0.5) * factor - 0.5
 
 
@@ -250,7 +238,7 @@ def refine_quads(image: Image, corners: Array) -> RefinedQuads:
 
 def _refine_quad(image: Image, quad: Array) -> tuple[Array, Array] | None:
     covariance = np.zeros((8, 8))
-    for _ in range(_ROUNDS):
+    for _ in range(WINDOW_ROUNDS):
         before = quad
         found = [
             _measure_side(image, quad[side], quad[(side + 1) % 4], _compute_winding(quad))
@@ -262,7 +250,7 @@ def _refine_quad(image: Image, quad: Array) -> tuple[Array, Array] | None:
         quad, covariance = _intersect_lines(quad, lines)
         if not np.all(np.isfinite(quad)):
             return None
-        if float(np.max(np.abs(quad - before))) < _CONVERGED_PX:
+        if float(np.max(np.abs(quad - before))) < SETTLED_PX:
             break
     return quad, covariance
 
@@ -283,11 +271,11 @@ def _make_side_frame(first: Array, second: Array, winding: float) -> tuple[float
 
 def _measure_side(image: Image, first: Array, second: Array, winding: float) -> _Line | None:
     length, along, outward = _make_side_frame(first, second, winding)
-    places = int(min((1.0 - 2.0 * _ENDS) * length, _MOST_PLACES))
-    if places < _LEAST_PLACES:
+    places = int(min((1.0 - 2.0 * SIDE_ENDS) * length, PLACES_MAX))
+    if places < PLACES_MIN:
         return None
-    half = float(np.clip(_WINDOW * length, _NARROWEST_PX, _WIDEST_PX))
-    tau = np.linspace(_ENDS - 0.5, 0.5 - _ENDS, places) * length
+    half = float(np.clip(WINDOW * length, WINDOW_MIN_PX, WINDOW_MAX_PX))
+    tau = np.linspace(SIDE_ENDS - 0.5, 0.5 - SIDE_ENDS, places) * length
     across = np.linspace(-half, half, 2 * int(np.ceil(2.0 * half)) + 1)
     middle = 0.5 * (first + second)
     xy = middle + tau[:, None, None] * along + across[None, :, None] * outward
@@ -303,7 +291,7 @@ def _measure_side(image: Image, first: Array, second: Array, winding: float) -> 
     inner, outer = across < -0.5 * half, across > 0.5 * half
     black, white = float(seen[:, inner].mean()), float(seen[:, outer].mean())
     rough = 0.5 * float(seen[:, inner].std() + seen[:, outer].std())
-    if white - black < _LEAST_CONTRAST * rough or white <= black:
+    if white - black < CONTRAST_MIN * rough or white <= black:
         return None
     # The trapezoidal mean: the two ends of the window count half.
     mean = (seen.sum(axis=1) - 0.5 * (seen[:, 0] + seen[:, -1])) / (seen.shape[1] - 1)
@@ -315,15 +303,15 @@ def _fit_line(tau: Array, step: Array, half: float) -> _Line | None:
     keep = np.ones(len(tau), dtype=np.bool_)
     offset = slope = sigma = 0.0
     for _ in range(2):
-        if int(keep.sum()) < _LEAST_PLACES:
+        if int(keep.sum()) < PLACES_MIN:
             return None
         design = np.column_stack([np.ones(int(keep.sum())), tau[keep]])
         (offset, slope), *_ = np.linalg.lstsq(design, step[keep], rcond=None)
         left = step - offset - slope * tau
         sigma = float(np.sqrt(np.sum(left[keep] ** 2) / max(int(keep.sum()) - 2, 1)))
-        keep = np.abs(left) <= max(_OUTLIER * sigma, 1e-6)
+        keep = np.abs(left) <= max(STEP_SIGMAS * sigma, 1e-6)
     count = int(keep.sum())
-    if count < _LEAST_PLACES or sigma > _RAGGED * half:
+    if count < PLACES_MIN or sigma > RAGGED_PART * half:
         return None
     centred = tau[keep] - tau[keep].mean()
     # Neighbouring places share pixels through interpolation, partly even when a px or two apart.

@@ -44,18 +44,14 @@ from semcal_ros.applications.servoing.pose import (
     fit_pose,
 )
 from semcal_ros.applications.servoing.settings import ServoSettings
+from semcal_ros.applications.servoing.thresholds import (
+    COMMAND_DELAY,
+    GAIN_MAX,
+    GAIN_WITHOUT_TIMES_MAX,
+    LATENCY_MAX_S,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError, Rejection
-
-# Largest part of the error that is removed per frame. With the latency predicted, up to 2 is
-# stable; without prediction 0.5 is still stable for a latency of two frames, whose limit is 0.618.
-_MOST_PER_FRAME = 0.5
-# Without times the latency cannot be predicted; a quarter does not overshoot with one frame of it.
-_MOST_WITHOUT_TIMES = 0.25
-# Frames and commands of one clock are not further apart.
-_LONGEST_LATENCY_S = 30.0
-# Delay with which a stage may obey a command (1-sigma), in frame intervals.
-_LATE = 0.5
 
 
 class ServoStatus(Enum):
@@ -276,7 +272,7 @@ class Servo:
         variance = variance + (self.settings.slip * float(np.hypot(way[0], way[1]))) ** 2
         # A command takes effect late, by an unknown part of an interval.
         change = self.history.at(time_s) - self.history.at(before.time_s)
-        late_m = _LATE * (time_s - before.time_s) * float(np.hypot(change[0], change[1]))
+        late_m = COMMAND_DELAY * (time_s - before.time_s) * float(np.hypot(change[0], change[1]))
         return way[:2], seen[:2], variance + late_m**2
 
     def _learn_axis(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> bool:
@@ -317,13 +313,13 @@ class Servo:
         limits = self.settings
         drift = self._observer.velocity_m_s if limits.feed_forward else np.zeros(2)
         latency_s = 0.0 if now_s is None else now_s - time_s
-        known = now_s is not None and 0.0 <= latency_s < _LONGEST_LATENCY_S
+        known = now_s is not None and 0.0 <= latency_s < LATENCY_MAX_S
         ahead = fit.pose
         if known:
             way = self._way(time_s, time_s + latency_s, fit.pose)
             dx, dy = way[:2] + drift * latency_s
             ahead = fit.pose.displace(float(dx), float(dy), float(way[2]))
-        most = _MOST_PER_FRAME if known else _MOST_WITHOUT_TIMES
+        most = GAIN_MAX if known else GAIN_WITHOUT_TIMES_MAX
         gain_hz = min(limits.gain_hz, most / interval_s)
         twist = -gain_hz * self._correction(fit, camera, ahead)
         twist[:2] -= drift

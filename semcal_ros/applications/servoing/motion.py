@@ -21,28 +21,25 @@ from collections import deque
 import numpy as np
 from numpy.typing import ArrayLike
 
+from semcal_ros.applications.servoing.thresholds import (
+    COMMANDS_KEPT,
+    DRIFT_FACTOR,
+    GATE_SIGMAS,
+    JUDGED_PX,
+    ODD_MAX,
+    TRAVEL_MAX,
+    TRAVEL_MIN,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
-
-# Commands that are kept: those of 30 s, the longest latency that is predicted, at 34 a second.
-_KEPT = 1024
-# Deviations (sigma) beyond which an innovation is not drift, and how many of them in a row are
-# drift after all.
-_GATE, _ODD = 5.0, 4
-# Factor on the expected drift in that case.
-_WIDER = 10.0
-# Commanded travel after which the stage is judged: well above drift and noise in that time.
-_JUDGED_PX = 36.0
-# Least and largest part of the commanded travel that must be seen.
-_LEAST, _MOST = 0.3, 3.0
 
 
 class CommandHistory:
     """Commanded velocities, each valid from its time on; zero before the first."""
 
     def __init__(self) -> None:
-        self._times: deque[float] = deque(maxlen=_KEPT)
-        self._twists: deque[Array] = deque(maxlen=_KEPT)
+        self._times: deque[float] = deque(maxlen=COMMANDS_KEPT)
+        self._twists: deque[Array] = deque(maxlen=COMMANDS_KEPT)
 
     def add(self, time_s: float, twist: ArrayLike) -> None:
         """Add a command (3,): x, y in m/s, rotation in rad/s.
@@ -113,10 +110,10 @@ class DisturbanceObserver:
         self.variance = self.variance + self._change**2 * interval_s
         surprise = unexplained_m / interval_s - self.velocity_m_s
         spread = self.variance + variance_m2 / interval_s**2 + 1e-30
-        if np.any(surprise**2 > _GATE**2 * spread):
+        if np.any(surprise**2 > GATE_SIGMAS**2 * spread):
             self._odd += 1
-            if self._odd >= _ODD:
-                self.variance = np.full(2, (_WIDER * self._sigma) ** 2)
+            if self._odd >= ODD_MAX:
+                self.variance = np.full(2, (DRIFT_FACTOR * self._sigma) ** 2)
                 self._odd = 0
             return
         self._odd = 0
@@ -146,11 +143,11 @@ class StageMonitor:
         self._path += float(np.hypot(commanded_px[0], commanded_px[1]))
         self._along += float(commanded_px @ seen_px)
         self._squared += float(commanded_px @ commanded_px)
-        if self._path < _JUDGED_PX:
+        if self._path < JUDGED_PX:
             return ""
         share = self._along / self._squared
         self._path = self._along = self._squared = 0.0
-        if _LEAST <= share <= _MOST:
+        if TRAVEL_MIN <= share <= TRAVEL_MAX:
             return ""
         return (
             f"the image does not follow the stage: it moved by {share:.2f} of the commanded distance; check axes, topic"

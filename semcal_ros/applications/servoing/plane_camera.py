@@ -22,13 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from semcal_ros.applications.servoing.thresholds import SAME_MATRIX
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.errors import InvalidValueError
 
-# Relative difference of two matrices from the same numbers, one divided and multiplied by rho
-# again.
-_SAME = 1e-9
 # Of the 12 elements of a projection, row by row, those that scale X and Y.
 _SCALE = (0, 1, 4, 5)
 
@@ -174,7 +172,9 @@ def choose_projection(k: ArrayLike, projections: Iterable[ArrayLike]) -> Array:
         )
     for matrix in reversed(known):
         expected = matrix[2, 2] * of_frame
-        if np.allclose(matrix[:, :3], expected, rtol=_SAME, atol=_SAME * abs(matrix[2, 2])):
+        if np.allclose(
+            matrix[:, :3], expected, rtol=SAME_MATRIX, atol=SAME_MATRIX * abs(matrix[2, 2])
+        ):
             return matrix
     raise InvalidValueError(
         f"none of the latest {len(known)} projections has the magnification of this frame",

@@ -24,16 +24,14 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.applications.servoing.detection import TargetView
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
+from semcal_ros.applications.servoing.thresholds import (
+    MISREAD_PART,
+    POSE_SETTLED_PX,
+    POSE_STEPS_MAX,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import as_points
 from semcal_ros.core.errors import InvalidValueError
-
-# Gauss-Newton steps, at most: from the similarity they converge quadratically or not at all.
-_MOST_STEPS = 12
-# Movement of the corners in the last step, px: far below their errors.
-_CONVERGED_PX = 1e-6
-# A marker further from its expected position than this part of its side was misread.
-_MISREAD = 0.25
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ def fit_pose(view: TargetView, camera: PlaneCamera) -> PoseFit:
         start, scale = _fit_similarity(kept, camera)
         misfit = np.linalg.norm(_compute_residual(kept, camera, start, scale), axis=2).max(axis=1)
         sides = np.linalg.norm(np.roll(kept.xy, -1, axis=1) - kept.xy, axis=2).mean(axis=1)
-        excess = misfit / (_MISREAD * sides)
+        excess = misfit / (MISREAD_PART * sides)
         if float(excess.max()) <= 1.0:
             break
         if len(kept.ids) <= 2 or 2 * (len(kept.ids) - 1) < len(view.ids):
@@ -182,7 +180,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
     pose, converged = start, False
     design, residual = np.empty((0, 3)), np.empty(0)
     target_xy_m = view.target_xy_m.reshape(-1, 2)
-    for _ in range(_MOST_STEPS):
+    for _ in range(POSE_STEPS_MAX):
         residual = _whiten(whitening, _compute_residual(view, camera, pose))
         moved = pose.apply(target_xy_m)
         slope = compute_interaction_of_points(camera, moved, pose.values[:2])
@@ -191,7 +189,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
         size = np.linalg.norm(design, axis=0)
         step = np.linalg.lstsq(design / size, residual, rcond=None)[0] / size
         pose = pose.displace(*(float(v) for v in step))
-        if float(np.max(np.abs(slope @ step))) < _CONVERGED_PX:
+        if float(np.max(np.abs(slope @ step))) < POSE_SETTLED_PX:
             converged = True
             break
     left = _compute_residual(view, camera, pose)
@@ -203,7 +201,7 @@ def _adjust(view: TargetView, camera: PlaneCamera, start: PlanePose, scale: floa
     covariance = np.linalg.inv(normal) / np.outer(size, size) * factor
     rms_px = float(np.sqrt(np.mean(np.sum(left**2, axis=2))))
     pose = PlanePose(pose.x_m, pose.y_m, math.remainder(pose.angle_rad, 2.0 * math.pi))
-    reason = "" if converged else f"the pose did not converge in {_MOST_STEPS} steps"
+    reason = "" if converged else f"the pose did not converge in {POSE_STEPS_MAX} steps"
     return PoseFit(pose, covariance, scale, _compute_scale_sigma(view), rms_px, view, reason)
 
 

@@ -29,29 +29,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.applications.servoing.thresholds import LEVELS_MAX, MARKER_BITS, MARKER_SIDE, RATIO
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
-
-# The middle cell of the 3 x 3 holds the next board.
-RATIO = 3
-"""How many times smaller the next board is."""
-
-# Leaves a white border of 0.15 of a cell, wider than one square of the marker (0.7 / 6 = 0.12).
-SIDE = 0.7
-"""Side of a marker over that of its cell; the rest is its white border."""
-
-# As generated from the dictionary below.
-MARKER_BITS = 6
-"""Squares along the side of a marker: four that code, and its black border."""
 
 # All cells of the 3 x 3 but the middle one.
 CELLS: tuple[tuple[int, int], ...] = tuple(
     (column, row) for row in (-1, 0, 1) for column in (-1, 0, 1) if (column, row) != (0, 0)
 )
 """(column, row) of the eight outer cells, in the order of their markers."""
-
-# Eight markers a level: the fifty of the dictionary are enough for six.
-_MOST_LEVELS = 6
 
 
 @lru_cache(maxsize=1)
@@ -78,13 +64,13 @@ class NestedTarget:
     """
 
     largest_cell_m: float = 180e-6
-    levels: int = _MOST_LEVELS
+    levels: int = LEVELS_MAX
 
     def __post_init__(self) -> None:
         check_positive(self.largest_cell_m, "a target with cells of", "m")
-        if not 1 <= self.levels <= _MOST_LEVELS:
+        if not 1 <= self.levels <= LEVELS_MAX:
             raise InvalidValueError(
-                f"a target with {self.levels} levels", expected=f"1 to {_MOST_LEVELS}"
+                f"a target with {self.levels} levels", expected=f"1 to {LEVELS_MAX}"
             )
 
     @property
@@ -103,7 +89,7 @@ class NestedTarget:
         """
         level, place = np.divmod(np.asarray(ids, dtype=np.int64), len(CELLS))
         cell = self.largest_cell_m / RATIO ** level.astype(np.float64)
-        half = 0.5 * SIDE
+        half = 0.5 * MARKER_SIDE
         around = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
         centre = np.array(CELLS, dtype=np.float64)[place]
         corners: Array = (centre[:, None, :] + around) * cell[:, None, None]

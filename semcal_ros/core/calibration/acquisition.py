@@ -33,17 +33,35 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from semcal_ros.core.arrays import AnyImage, Array, check_positive
-from semcal_ros.core.calibration.judgement.plan import PLANNED_TILTS_RAD, plan_views
+from semcal_ros.core.arrays import AnyImage, Array, check_positive, mad_sigma
+from semcal_ros.core.calibration.estimator.thresholds import SPREAD_COUNT_MIN
+from semcal_ros.core.calibration.judgement.plan import plan_views
+from semcal_ros.core.calibration.judgement.thresholds import PLANNED_TILTS_RAD, SQUARES_ACROSS_MIN
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.calibration.thresholds import (
+    BLURRED_PART,
+    MAGNIFICATION_OFF,
+    MOVED_MIN,
+    OFF_CENTRE_MAX,
+    PROBE_SQUARES,
+    ROUND_WORTH,
+    SATURATED_PART,
+    SHIFT_SCATTER_MAX,
+    SPANNED_PART,
+    SURVEY_RATIO,
+    TILT_MAX_RAD,
+    TILT_OFF_RAD,
+    VIEW_ROTATION_RAD,
+    VIEWS_MAX,
+    VISIT_ROTATION_RAD,
+    VISITS_AT_ONCE,
+)
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.wording import counted
 
 __all__ = [
-    "MOST_VIEWS",
-    "PROBE_SQUARES",
     "AcquisitionGoal",
     "Proposal",
     "ViewRequest",
@@ -59,18 +77,6 @@ __all__ = [
     "propose_visits",
     "request_of_picture",
 ]
-
-PROBE_SQUARES = 0.3
-"""Length of the moves to learn from, in squares: more than any backlash that lets a stage be used at this
-magnification, and less than the half beyond which the next corner is nearer."""
-
-# Middle of what is seen of the grid, off the middle of the image, as a part of the image.
-_OFF = 0.08
-# Spread of the displacements of single corners, in squares, above which pictures do not show the same corners.
-_SPREAD = 0.15
-# A move of the stage over that of the image, in squares each: 1, or the cosine of the tilt (0.34 at 70 degrees); below
-# this, the stage has not moved or the picture is older than the move.
-_LEAST_MOVED = 0.2
 
 
 def _middle_off_px(detection: LatticeDetection) -> Array:
@@ -88,7 +94,7 @@ def grid_is_centred(detection: LatticeDetection) -> bool:
         Its corners.
     """
     off = np.abs(_middle_off_px(detection)) / np.array(detection.image_size)
-    return bool(np.all(off <= _OFF))
+    return bool(np.all(off <= OFF_CENTRE_MAX))
 
 
 def lattice_shift(before: LatticeDetection, after: LatticeDetection) -> Array:
@@ -112,8 +118,8 @@ def lattice_shift(before: LatticeDetection, after: LatticeDetection) -> Array:
     spacing_px = min(before.spacing_px, after.spacing_px)
     same = distance < 0.5 * spacing_px
     ways = after.xy[same] - before.xy[nearest[same]]
-    spread = 1.4826 * np.median(np.abs(ways - np.median(ways, axis=0))) if len(ways) else np.inf
-    if 2 * len(ways) < len(after.xy) or spread > _SPREAD * spacing_px:
+    spread = mad_sigma(ways - np.median(ways, axis=0)) if len(ways) else np.inf
+    if 2 * len(ways) < len(after.xy) or spread > SHIFT_SCATTER_MAX * spacing_px:
         raise CalibrationError(
             "the corners of two pictures do not move together",
             expected=f"a grid that follows a move of {PROBE_SQUARES:g} squares",
@@ -142,7 +148,7 @@ def image_from_stage(ways_m: Array, shifts_px: Array, nominal_px_per_m: float) -
     """
     matrix = np.asarray(np.linalg.solve(ways_m, shifts_px).T, dtype=np.float64)
     least = float(np.linalg.svd(matrix, compute_uv=False)[-1])
-    if not least > _LEAST_MOVED * nominal_px_per_m:
+    if not least > MOVED_MIN * nominal_px_per_m:
         moved = ", ".join(f"{np.hypot(*shift):.1f} px" for shift in shifts_px)
         expected = ", ".join(f"{np.hypot(*way) * nominal_px_per_m:.1f} px" for way in ways_m)
         raise CalibrationError(
@@ -166,36 +172,6 @@ def find_stage_move(detection: LatticeDetection, px_per_m: Array) -> Array:
         (2, 2) as :func:`image_from_stage` returns it.
     """
     return np.asarray(-np.linalg.solve(px_per_m, _middle_off_px(detection)), dtype=np.float64)
-
-
-MOST_VIEWS = 300
-"""Views that an acquisition takes at most, by default. Three seeds of a microscope and a one-axis stage needed 111, 153
-and 243 for 0.1 % from 500x to 10 000x (`python -m benchmarks.acquisition`); an acquisition whose further views would
-hardly help ends before."""
-
-# Ratio of neighbouring magnifications of the survey: the functions of a calibration are smooth over a factor of two.
-_SURVEY_RATIO = 1.7
-_FEWEST_VISITS = 4
-# Visits between two calibrations: what they bring was predicted, so that there is little to learn from each alone.
-_AT_ONCE = 4
-# A round that is predicted to lower the largest sigma by less than this part is not worth the time.
-_WORTH = 0.02
-# Turns of the views of one visit, and from visit to visit: the golden angle never repeats a direction (Vogel 1979).
-_TURN_RAD = 1.1
-_GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
-# Squares across the image that a view should show, at least.
-_SQUARES_ACROSS = 8.0
-_STEEPEST_RAD = math.radians(60.0)
-# Share of pixels at one end of the detector's range from which edges are cut off.
-_SATURATED = 0.05
-# Blur of the edges, as a part of the spacing, from which corners of neighbouring squares run into each other.
-_BLURRED = 0.25
-# Relative difference of a magnification from the one that was asked for: what a display rounds.
-_MAGNIFICATION_OFF = 0.02
-# Tilt that is no longer the one that was asked for.
-_TILT_OFF_RAD = math.radians(2.0)
-# Part of the image, along x and y, that the grid must span.
-_SPANNED = 0.6
 
 
 @dataclass(frozen=True)
@@ -223,7 +199,7 @@ class AcquisitionGoal:
     display_width_m: float
     target: float = 1e-3
     tilts_rad: tuple[float, ...] = PLANNED_TILTS_RAD
-    most_views: int = MOST_VIEWS
+    most_views: int = VIEWS_MAX
 
     def __post_init__(self) -> None:
         low, high = self.magnification_range
@@ -243,10 +219,10 @@ class AcquisitionGoal:
                 f"tilts of {[round(math.degrees(t), 1) for t in self.tilts_rad]} degrees",
                 expected="at least two that are 6 degrees apart",
             )
-        if max(map(abs, self.tilts_rad)) > _STEEPEST_RAD:
+        if max(map(abs, self.tilts_rad)) > TILT_MAX_RAD:
             raise InvalidValueError(
                 f"a tilt of {math.degrees(max(map(abs, self.tilts_rad))):.0f} degrees",
-                expected=f"{math.degrees(_STEEPEST_RAD):.0f} degrees at most",
+                expected=f"{math.degrees(TILT_MAX_RAD):.0f} degrees at most",
             )
         needed = len(self.tilts_rad) * len(_survey_magnifications(self.magnification_range))
         if self.most_views < needed:
@@ -308,16 +284,16 @@ class Proposal:
 def _survey_magnifications(magnification_range: tuple[float, float]) -> tuple[float, ...]:
     low, high = magnification_range
     if low == high:
-        return (low,) * _FEWEST_VISITS
-    steps = math.ceil(math.log(high / low) / math.log(_SURVEY_RATIO) - 1e-9)
-    visits = np.geomspace(low, high, max(steps + 1, _FEWEST_VISITS))
+        return (low,) * SPREAD_COUNT_MIN
+    steps = math.ceil(math.log(high / low) / math.log(SURVEY_RATIO) - 1e-9)
+    visits = np.geomspace(low, high, max(steps + 1, SPREAD_COUNT_MIN))
     visits[0], visits[-1] = low, high
     return tuple(float(g) for g in visits)
 
 
 def _square_in_view(goal: AcquisitionGoal, magnification: float) -> float:
     field_m = goal.display_width_m / magnification
-    fitting = [size for size in goal.squares_m if field_m / size >= _SQUARES_ACROSS]
+    fitting = [size for size in goal.squares_m if field_m / size >= SQUARES_ACROSS_MIN]
     return max(fitting) if fitting else min(goal.squares_m)
 
 
@@ -331,7 +307,9 @@ def _requests_of(
             visit,
             magnification,
             tilt,
-            math.remainder(0.2 + _GOLDEN_RAD * visit + _TURN_RAD * number, 2.0 * math.pi),
+            math.remainder(
+                0.2 + VISIT_ROTATION_RAD * visit + VIEW_ROTATION_RAD * number, 2.0 * math.pi
+            ),
             square_m,
         )
         for number, tilt in enumerate(goal.tilts_rad)
@@ -368,7 +346,7 @@ def propose_visits(
         model,
         goal.target,
         squares_m=goal.squares_m,
-        most_visits=max(1, min(_AT_ONCE, left)),
+        most_visits=max(1, min(VISITS_AT_ONCE, left)),
         single_setting=False,
     )
     reason = ""
@@ -376,7 +354,7 @@ def propose_visits(
         reason = "the target is met"
     elif left < 1:
         reason = f"{counted(goal.most_views, 'view')} are all that were allowed"
-    elif not plan.visits or plan.visits[-1].largest > (1.0 - _WORTH) * plan.largest:
+    elif not plan.visits or plan.visits[-1].largest > (1.0 - ROUND_WORTH) * plan.largest:
         reason = "more views would hardly help"
     first = 1 + max((request.visit for request in taken), default=-1)
     requests: tuple[ViewRequest, ...] = ()
@@ -391,7 +369,7 @@ def propose_visits(
 
 def is_same_magnification(wanted: float, magnification: float) -> bool:
     """Return whether a magnification is the one that was asked for, as far as a display tells it."""
-    return abs(magnification / wanted - 1.0) <= _MAGNIFICATION_OFF
+    return abs(magnification / wanted - 1.0) <= MAGNIFICATION_OFF
 
 
 def is_magnification_of(request: ViewRequest, magnification: float) -> bool:
@@ -418,7 +396,7 @@ def request_of_picture(
     None for a magnification outside the range.
     """
     low, high = goal.magnification_range
-    if not low / (1.0 + _MAGNIFICATION_OFF) <= magnification <= high * (1.0 + _MAGNIFICATION_OFF):
+    if not low / (1.0 + MAGNIFICATION_OFF) <= magnification <= high * (1.0 + MAGNIFICATION_OFF):
         return None
     known = stage or StageReading()
     return ViewRequest(
@@ -441,7 +419,7 @@ def find_exposure_fault(image: AnyImage) -> str:
     grey = np.asarray(image, dtype=np.float64)
     largest = 2.0 ** (8 * image.dtype.itemsize) - 1.0 if image.dtype.kind == "u" else math.inf
     dark, bright = float(np.mean(grey <= 0.0)), float(np.mean(grey >= largest))
-    if max(dark, bright) <= _SATURATED:
+    if max(dark, bright) <= SATURATED_PART:
         return ""
     share, end = max((dark, "black"), (bright, "white"))
     return f"{100.0 * share:.0f} % of the pixels are {end}: change brightness or contrast"
@@ -468,16 +446,16 @@ def find_picture_fault(
     """
     if stage is not None and stage.tilt_rad is not None:
         off = stage.tilt_rad - request.tilt_rad
-        if abs(off) > _TILT_OFF_RAD:
+        if abs(off) > TILT_OFF_RAD:
             return (
                 f"the stage is tilted by {math.degrees(stage.tilt_rad):.1f} degrees"
                 f" instead of {math.degrees(request.tilt_rad):.1f}"
             )
     if fault := find_exposure_fault(image):
         return fault
-    if detection.blur_px > _BLURRED * detection.spacing_px:
+    if detection.blur_px > BLURRED_PART * detection.spacing_px:
         return f"out of focus: edges are blurred by {detection.blur_px:.1f} px"
     spanned = np.ptp(detection.xy, axis=0) / np.array(detection.image_size)
-    if min(spanned) < _SPANNED:
+    if min(spanned) < SPANNED_PART:
         return f"the grid fills {100.0 * float(min(spanned)):.0f} % of the image: move it to the middle"
     return ""

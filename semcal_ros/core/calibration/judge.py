@@ -37,6 +37,7 @@ from semcal_ros.core.calibration.judgement.scale_checks import (
 from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model, rank_findings
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.solve import JointFit, without_magnification
+from semcal_ros.core.calibration.thresholds import MISFIT_MAX
 from semcal_ros.core.calibration.views import GridView, RejectedView, show_lines
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
@@ -184,11 +185,6 @@ def collect_statistics(
     }
 
 
-# Ratio of residuals to the sigmas of the corners beyond which the misfit is due to the model or the
-# grid: the sigmas of the corners themselves are right to a tenth (benchmarks, "Corner finding").
-_MISFIT = 1.3
-
-
 @dataclass(frozen=True)
 class CalibrationResult:
     """A calibration with the views from which it was computed.
@@ -231,7 +227,7 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     findings = []
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
-    if misfit > _MISFIT:
+    if misfit > MISFIT_MAX:
         excess_px, excess_at = measure_excess(setup, fit)
         findings.append(
             Finding(

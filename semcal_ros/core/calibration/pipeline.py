@@ -45,10 +45,8 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_factor
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup, build_problem
-from semcal_ros.core.calibration.estimator.residual_field_fit import (
-    ENOUGH_MAGNIFICATIONS,
-    undo_field,
-)
+from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
+from semcal_ros.core.calibration.estimator.thresholds import MAGNIFICATIONS_MIN
 from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
 from semcal_ros.core.calibration.judgement.outliers import (
     find_outliers,
@@ -78,6 +76,18 @@ from semcal_ros.core.calibration.start import (
     start,
     with_excess,
 )
+from semcal_ros.core.calibration.thresholds import (
+    APART_RAD,
+    DETERMINED_PART,
+    IRREGULAR_RATIO,
+    NEARER_PART,
+    REFUSED_PART,
+    SCALE_FACTOR_TOLD,
+    SUSPECTS_MAX,
+    UNTILTED_CONFIDENCE,
+    VIEWS_MIN,
+    WORTHWHILE_PART,
+)
 from semcal_ros.core.calibration.views import (
     GridView,
     RejectedView,
@@ -93,20 +103,7 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 
-__all__ = ["FEWEST_VIEWS", "are_enough", "calibrate_views", "fit_joint", "prepare"]
-
-# A parallel view gives one equation beyond its own pose; scale, aspect and skew are three unknowns.
-FEWEST_VIEWS = 3
-# Display widths and squares that are stated are right to some per cent, and tilts shorten lengths by as much.
-_TELLING_FACTOR = 1.2
-# A grid that seems to be so many times less regular than lithography makes it: perhaps one view is wrong.
-_IRREGULAR = 4.0
-# Views that are left out to see.
-_SUSPECTS = 3
-# Part of the untilted recordings that are seen to be such, and the part of the uncertainty that knowing it leaves.
-_CONFIDENCE, _MUCH_LESS = 0.95, 0.7
-# Part of the tilts that are refused, and of the angle to the stage's own, at which it is the axis that is wrong.
-_MOST_REFUSED, _MUCH_NEARER = 0.5, 0.3
+__all__ = ["are_enough", "calibrate_views", "fit_joint", "prepare"]
 
 
 def calibrate_views(
@@ -220,19 +217,12 @@ def fit_joint(
 
 
 def are_enough(views: Sequence[GridView], options: CalibrationOptions) -> bool:
-    """Whether there are as many views as a calibration needs: :data:`FEWEST_VIEWS`, or one if all tilts are known."""
-    if len(views) >= FEWEST_VIEWS:
+    """Whether there are as many views as a calibration needs: :data:`VIEWS_MIN`, or one if all tilts are known."""
+    if len(views) >= VIEWS_MIN:
         return True
     named = set() if isinstance(options.untilted, str) else set(options.untilted)
     known = options.untilted == "all" or all(v.has_stage_tilt or v.name in named for v in views)
     return bool(views) and known and options.method == "joint"
-
-
-# Part of the largest singular value below which views of lines leave a linear distortion to its prior: where they run
-# in two directions only, within 3 degrees, it is 0.02 or less.
-_DETERMINED = 0.05
-# Angle between lines below which they count as one direction: of 8 degrees, a pixel size was wrong by 8 %, 4 sigmas.
-_APART_RAD = np.radians(30.0)
 
 
 def _prepare_lines(
@@ -250,7 +240,7 @@ def _prepare_lines(
     refuse_tilted_lines(views)
     flat = tuple(replace(view, stage=None) for view in views)
     open_directions = _find_open_directions(flat)
-    if options.residual == "auto" and len({v.magnification for v in views}) < ENOUGH_MAGNIFICATIONS:
+    if options.residual == "auto" and len({v.magnification for v in views}) < MAGNIFICATIONS_MIN:
         # A view that is left out has a direction of its own, which the others do not predict.
         options = replace(options, residual="off")
     return flat, replace(options, untilted="all"), open_directions
@@ -268,13 +258,13 @@ def _find_open_directions(views: Sequence[GridView]) -> list[Finding]:
     x, y = (across / np.linalg.norm(across, axis=1, keepdims=True)).T
     # The distance of lines changes with the stretch along both axes, and with the shear.
     values = np.linalg.svd(np.stack([x * x, y * y, x * y], axis=1), compute_uv=False)
-    known = int(np.sum(values > _DETERMINED * values[0]))
+    known = int(np.sum(values > DETERMINED_PART * values[0]))
     apart = float(np.max(np.arccos(np.clip(np.abs(np.outer(x, x) + np.outer(y, y)), 0.0, 1.0))))
-    if apart < _APART_RAD:
+    if apart < APART_RAD:
         raise CalibrationError(
             f"parallel lines that run in one direction in all views, within {np.degrees(apart):.0f} degrees, so that "
             "lengths along them are not known",
-            expected=f"lines in at least two directions, {np.degrees(_APART_RAD):.0f} degrees apart, best in three",
+            expected=f"lines in at least two directions, {np.degrees(APART_RAD):.0f} degrees apart, best in three",
             do="add views with the grating turned by 90 and by 45 degrees",
         )
     if known >= 3:
@@ -300,7 +290,7 @@ def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tupl
     if not are_enough(views, options):
         raise CalibrationError(
             f"a calibration from {counted(len(views), 'view')}",
-            expected=f"at least {FEWEST_VIEWS} views of the grid in different directions, or views whose tilt is known",
+            expected=f"at least {VIEWS_MIN} views of the grid in different directions, or views whose tilt is known",
             do="add tilted views, or say that the grid was not tilted (--untilted all)",
         )
     for view in views:
@@ -334,7 +324,7 @@ def _check_converged(setup: Setup, fit: MethodFit, factor: float) -> None:
     """Refuse a fit that is not at a minimum, or that ended far from the nominal scale."""
     if fit.failure:
         advice = "leave out what are not such views"
-        if not 1.0 / _TELLING_FACTOR < factor < _TELLING_FACTOR:
+        if not 1.0 / SCALE_FACTOR_TOLD < factor < SCALE_FACTOR_TOLD:
             advice += "; " + advise_scale(factor, **_units(setup))
         raise UnusableCalibrationError(
             f"an adjustment that did not converge ({fit.failure}), where the images show {factor:.3g} "
@@ -410,7 +400,7 @@ def _propose_untilted(setup: Setup, joint: JointFit, fit: MethodFit) -> list[Fin
     rise = (
         2.0 * (result.cost - own.result.cost) / max(variance_factor(own.problem, own.result), 1.0)
     )
-    limit = float(chi2.ppf(_CONFIDENCE, 2 * len(setup.views)))
+    limit = float(chi2.ppf(UNTILTED_CONFIDENCE, 2 * len(setup.views)))
     if rise > limit:
         return []
     try:
@@ -418,7 +408,7 @@ def _propose_untilted(setup: Setup, joint: JointFit, fit: MethodFit) -> list[Fin
     except CalibrationError:
         return []
     now, then = (_worst_sigma(setup, one) for one in (fit, describe_fit(flat, other)))
-    if then > _MUCH_LESS * now:
+    if then > WORTHWHILE_PART * now:
         return []
     return [
         Finding(
@@ -446,7 +436,7 @@ def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit
     refused = [
         k for k, v in enumerate(setup.views) if v.stage is None and given[v.name].has_stage_tilt
     ]
-    if len(refused) < max(_MOST_REFUSED * told, 1.0):
+    if len(refused) < max(REFUSED_PART * told, 1.0):
         return []
     readings = [given[setup.views[k].name].stage for k in refused]
     seen = fit.adjustment.result.state.rotations[refused, :, 2]
@@ -457,7 +447,7 @@ def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit
         return float(np.median(np.linalg.norm(expected - seen, axis=1)))
 
     turned = replace(setup.axis, tilt_axis_rad=setup.axis.tilt_axis_rad + np.pi)
-    if median_angle(turned) > _MUCH_NEARER * median_angle(setup.axis):
+    if median_angle(turned) > NEARER_PART * median_angle(setup.axis):
         return []
     return [
         Finding(
@@ -475,13 +465,13 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
     """
     usual = setup.priors.grid_stretch_sigma
     lattice = fit.adjustment.spread.lattice_sigma
-    if lattice is None or float(np.max(lattice)) < _IRREGULAR * usual:
+    if lattice is None or float(np.max(lattice)) < IRREGULAR_RATIO * usual:
         return {}
     deviations = measure_deviations(fit.adjustment.problem, fit.adjustment.result)
     count = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
     suspects = [
         int(v)
-        for v in np.argsort(-deviations.sigmas)[:_SUSPECTS]
+        for v in np.argsort(-deviations.sigmas)[:SUSPECTS_MAX]
         if count[setup.views[int(v)].magnification] > 2
     ]
     left = {}
@@ -492,7 +482,7 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
         other = fit_joint(replace(setup, views=views), "off").adjustment.spread.lattice_sigma
         left[suspect] = np.inf if other is None else float(np.max(other))
     best = min(left, key=lambda v: left[v], default=None)
-    if best is None or left[best] > float(np.max(lattice)) / _IRREGULAR:
+    if best is None or left[best] > float(np.max(lattice)) / IRREGULAR_RATIO:
         return {}
     return {best: deviations.reject(best)}
 

@@ -61,6 +61,21 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
 )
 from semcal_ros.core.calibration.estimator.variance_components import update_components
 from semcal_ros.core.calibration.start import Start, tempered
+from semcal_ros.core.calibration.thresholds import (
+    BELIEF_STEP_MIN,
+    BELIEF_STEPS,
+    CHOICE_GAIN,
+    CHOICE_ROUNDS,
+    CHOOSING_ROUNDS,
+    COEFFICIENT_GAIN,
+    EXPLAINED_MIN,
+    FIELD_ROUNDS,
+    FIELD_SETTLED_PX,
+    FREE_ROUNDS,
+    SCAN_SIZE_MAX,
+    SIZE_MAX,
+    TERM_GAIN,
+)
 from semcal_ros.core.calibration.views import estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -78,20 +93,8 @@ __all__ = [
     "select_functions",
 ]
 
-# Most coefficients of one function. It bounds the search; with few magnifications their number is
-# the smaller limit.
-_MAX_SIZE = 8
 # What a function may be: a polynomial in log g or in g.
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
-# Gain in half chi-squares that pays for one coefficient, as in Akaike's criterion.
-_GAIN_PER_COEFFICIENT = 1.0
-# That of a term that is not there yet: by chance in one of 600 terms that are not needed, as the chance of a chi-square
-# of one degree of freedom above 10.
-_GAIN_OF_TERM = 5.0
-# Most coefficients of a function of the scan: coils and settling hardly change with the magnification.
-_MAX_SCAN_SIZE = 3
-# Gain in half chi-squares by which a choice must be better to replace the previous one.
-_CLEARLY = 2.0
 
 
 @dataclass(frozen=True)
@@ -234,7 +237,7 @@ def select_functions(
     """Choose (kind, size) of the functions named in ``free`` and ``terms`` greedily.
 
     Coefficients are added one or two at a time, as polynomials in log g or in g, as long as the
-    cross-validation gains more than :data:`_GAIN_PER_COEFFICIENT` for each, and removed where that
+    cross-validation gains more than :data:`COEFFICIENT_GAIN` for each, and removed where that
     costs less. One of ``terms`` may have none, and needs more of a gain for the first. The ``current``
     choice stays unless another one is clearly better.
     """
@@ -242,7 +245,7 @@ def select_functions(
     # Each magnification is predicted from the others. Two are only fitted, by a straight line.
     known = len(setup.magnifications)
     most = known if known == 2 else known - 1
-    limits = {name: min(_MAX_SIZE, most) for name in free}
+    limits = {name: min(SIZE_MAX, most) for name in free}
     limits |= {name: min(_most_of(name), max(most, 1)) for name in terms}
     sizes = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
     sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
@@ -262,27 +265,27 @@ def select_functions(
         sizes[best[1]] = best[2]
     if current is not None:
         kept = {**sizes, **current}
-        more = sum(kept[name][1] - sizes[name][1] for name in free) * _GAIN_PER_COEFFICIENT
+        more = sum(kept[name][1] - sizes[name][1] for name in free) * COEFFICIENT_GAIN
         more += sum(_price(kept[name][1]) - _price(sizes[name][1]) for name in terms)
-        if candidates.score(kept) + more < score + _CLEARLY:
+        if candidates.score(kept) + more < score + CHOICE_GAIN:
             sizes = kept
     return {name: sizes[name] for name in (*free, *terms)}
 
 
 def _most_of(name: str) -> int:
     """Return the most coefficients that a function may have."""
-    return _MAX_SCAN_SIZE if name in SCAN_NAMES else _MAX_SIZE
+    return SCAN_SIZE_MAX if name in SCAN_NAMES else SIZE_MAX
 
 
 def _cost(option: tuple[str, int]) -> float:
     """Return what a function that is always there must gain: that in g itself somewhat more, as it is less natural."""
     kind, size = option
-    return _GAIN_PER_COEFFICIENT * (size + (kind != "chebyshev_log"))
+    return COEFFICIENT_GAIN * (size + (kind != "chebyshev_log"))
 
 
 def _price(size: int) -> float:
     """Return what a term of so many coefficients must gain."""
-    return 0.0 if size == 0 else _GAIN_OF_TERM + _GAIN_PER_COEFFICIENT * (size - 1)
+    return 0.0 if size == 0 else TERM_GAIN + COEFFICIENT_GAIN * (size - 1)
 
 
 def _moves(
@@ -300,26 +303,6 @@ def _moves(
     return moves
 
 
-# Rounds of choosing the numbers of coefficients. A choice that alternates never converges; the
-# calibration then carries a warning.
-_MAX_ROUNDS = 5
-# Rounds in which a choice has no right to stay once the corners count as stated, so that it does not depend on where
-# the fit came from. Before, a choice that went to and fro would lead astray.
-_FREE_ROUNDS = 2
-# Steps in which corners come to be believed, and the part of the excess noise beyond which there is no further one.
-_MOST_STEPS, _LEAST_STEP = 3, 0.7
-# Turns of field and adjustment at most, and those in which strength and numbers of coefficients may
-# change; with both fixed the turns converge.
-_MAX_FIELD_TURNS, _CHOOSING_TURNS = 30, 2
-# Part of the misfit that a field must explain: distortion of the scan that none of the other
-# parameters describes is explained to nine tenths, settling that is narrower than the knots to a quarter, and the waves
-# of a grid to a sixth.
-_LEAST_EXPLAINED = 0.2
-# RMS change of the corrections of all corners, px, at which the field has converged: a fiftieth of
-# the noise of good corners.
-_FIELD_CONVERGED_PX = 1e-3
-
-
 def excess_px(setup: Setup, adjustment: Adjustment) -> float:
     """Return the scatter of the corners of an adjustment beyond their own sigmas."""
     residuals = adjustment.result.residuals_px
@@ -329,10 +312,10 @@ def excess_px(setup: Setup, adjustment: Adjustment) -> float:
 def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, Adjustment]:
     """Believe the corners as far as the model explains them, step by step; return the last setup and adjustment."""
     level = max(view.excess_px for view in noisy.views)
-    for _ in range(_MOST_STEPS):
+    for _ in range(BELIEF_STEPS):
         excess = min(excess_px(setup, adjustment), level)
         # The first step brings in what the stage says.
-        if np.isfinite(noisy.tempering) and (level == 0.0 or excess > _LEAST_STEP * level):
+        if np.isfinite(noisy.tempering) and (level == 0.0 or excess > BELIEF_STEP_MIN * level):
             break
         level, noisy = excess, tempered(setup, excess)
         spread = update_components(noisy, adjustment.problem, adjustment.result)
@@ -362,11 +345,11 @@ def select_and_adjust(
     terms: tuple[str, ...] = ()
     if choose_terms and not setup.priors.is_wide:
         terms = tuple(name for name in TERM_NAMES if name not in always)
-    while rounds < _MAX_ROUNDS and not converged:
+    while rounds < CHOICE_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=(*always, *terms))
         summary = Summary.of(every, refine(every, result.state, max_iterations=0))
-        kept = None if setup.tempering == 1.0 and rounds <= _FREE_ROUNDS else sizes
+        kept = None if setup.tempering == 1.0 and rounds <= FREE_ROUNDS else sizes
         chosen = select_functions(summary, setup, functions, always, terms, kept)
         if chosen == sizes:
             result, count = adjust_with_other_poses(setup, functions, spread, problem, result.state)
@@ -405,12 +388,12 @@ def _add_field(
     """
     field = blank = blank_field(setup)
     start, before = adjustment, setup
-    for turn in range(_MAX_FIELD_TURNS):
+    for turn in range(FIELD_ROUNDS):
         if np.any(adjustment.result.lost):
             # A field that moves corners to where the camera shows nothing is none.
             return start, None, None
         system = field_system(setup, adjustment.problem, adjustment.result, field)
-        if turn < _CHOOSING_TURNS:
+        if turn < CHOOSING_ROUNDS:
             try:
                 choice = choose_field(setup, system, blank)
             except UnusableCalibrationError:
@@ -423,15 +406,15 @@ def _add_field(
             if turn == 0 and setup.shared and not always:
                 pattern = _grid_pattern(setup, adjustment, field)
                 of_grid = pattern is not None and pattern.choice.gain > choice.gain
-                if of_grid or choice.explained < _LEAST_EXPLAINED:
+                if of_grid or choice.explained < EXPLAINED_MIN:
                     return start, None, pattern
         theta, field = solve_field(system, choice.prior, blank)
         after = undo_field(setup, field)
-        adjustment = _readjust(after, adjustment, theta, choosing=turn < _CHOOSING_TURNS)
+        adjustment = _readjust(after, adjustment, theta, choosing=turn < CHOOSING_ROUNDS)
         pairs = zip(before.views, after.views, strict=True)
         change = np.concatenate([a.image_xy - b.image_xy for b, a in pairs])
         before = after
-        if turn >= _CHOOSING_TURNS and np.sqrt(np.mean(change**2)) < _FIELD_CONVERGED_PX:
+        if turn >= CHOOSING_ROUNDS and np.sqrt(np.mean(change**2)) < FIELD_SETTLED_PX:
             return adjustment, FittedField(field, choice, system, True), None
     return adjustment, FittedField(field, choice, system, False), None
 

@@ -54,7 +54,10 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     solve_field,
     undo_field,
 )
-from semcal_ros.core.calibration.estimator.trust_region import MIN_DAMPING
+from semcal_ros.core.calibration.estimator.thresholds import (
+    DAMPING_MIN,
+    NAMED_MAX,
+)
 from semcal_ros.core.calibration.estimator.variance_components import (
     accelerate_components,
     largest_change,
@@ -63,22 +66,18 @@ from semcal_ros.core.calibration.estimator.variance_components import (
 )
 from semcal_ros.core.calibration.select import Selection, select_and_adjust
 from semcal_ros.core.calibration.start import with_excess
+from semcal_ros.core.calibration.thresholds import (
+    EXACT_STEPS_MAX,
+    EXACT_TOLERANCE,
+    SPREAD_CHANGE,
+    SPREAD_UPDATES_MAX,
+    UPDATE_PREDICTED,
+    UPDATE_TOLERANCE,
+)
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = ["JointFit", "solve", "without_magnification"]
-
-# Updates of the variance components at most, until they change by less than the last number: a mirrored recording then
-# gives the mirrored camera to a millionth of a sigma.
-_LAST_UPDATES, _SMALL_CHANGE = 40, 1e-6
-# What an adjustment between two updates may leave, relative to the cost and in half chi-squares: with more, the updates
-# go to and fro instead of ending.
-_NEAR, _PREDICTED = 1e-9, 1e-6
-# Of the last adjustment, relative to the cost and in half chi-squares. It starts undamped: a damped first step along
-# what is hardly determined is so short that it would pass for the last.
-_EXACT, _MOST_ITERATIONS = 1e-10, 300
-# Views that a message names.
-_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -118,10 +117,10 @@ def _refuse_lost_corners(setup: Setup, adjustment: Adjustment) -> None:
     if not np.any(lost):
         return
     views = sorted({int(v) for v in adjustment.problem.view_of_point[lost]})
-    more = f" and {len(views) - _NAMED} more" if len(views) > _NAMED else ""
+    more = f" and {len(views) - NAMED_MAX} more" if len(views) > NAMED_MAX else ""
     raise UnusableCalibrationError(
         "an adjustment whose camera cannot show corners of "
-        f"{', '.join(setup.views[v].name for v in views[:_NAMED])}{more}",
+        f"{', '.join(setup.views[v].name for v in views[:NAMED_MAX])}{more}",
         expected="views of one flat grid, by one microscope, at the magnifications that are stated",
         do="leave these views out, or check magnifications, --display-width and --squares",
     )
@@ -138,25 +137,29 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     spread = limit_components(setup, spread)
     state, _ = try_other_poses(setup, functions, spread, adjustment.result.state)
     updates: list[tuple[VarianceComponents, VarianceComponents]] = []
-    while len(updates) < _LAST_UPDATES:
+    while len(updates) < SPREAD_UPDATES_MAX:
         problem = build_problem(setup, functions, setup.views, spread)
         result = refine(
-            problem, state, tolerance=_NEAR, predicted=_PREDICTED, first_damping=MIN_DAMPING
+            problem,
+            state,
+            tolerance=UPDATE_TOLERANCE,
+            predicted=UPDATE_PREDICTED,
+            first_damping=DAMPING_MIN,
         )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
         updates.append((spread, update_components(setup, problem, result)))
-        if largest_change(*updates[-1]) < _SMALL_CHANGE:
+        if largest_change(*updates[-1]) < SPREAD_CHANGE:
             break
         spread = accelerate_components(updates)
     problem = build_problem(setup, functions, setup.views, spread)
     result = refine(
         problem,
         state,
-        tolerance=_EXACT,
-        predicted=_EXACT,
-        first_damping=MIN_DAMPING,
-        max_iterations=_MOST_ITERATIONS,
+        tolerance=EXACT_TOLERANCE,
+        predicted=EXACT_TOLERANCE,
+        first_damping=DAMPING_MIN,
+        max_iterations=EXACT_STEPS_MAX,
     )
     functions = with_coefficients(functions, result.state.theta)
     return replace(adjustment, functions=functions, problem=problem, result=result, spread=spread)

@@ -43,6 +43,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.calibration.thresholds import FRAMES_MIN, ONE_LINE_RATIO, ONE_SIGMA
 from semcal_ros.core.camera.plane_geometry import cross_products, rotations_from_vectors
 from semcal_ros.core.errors import InvalidValueError
 
@@ -293,14 +294,6 @@ def height_of_tilt(
     return height, np.concatenate([cross_products(normal, by_normal), by_shift], axis=1), by_miss
 
 
-# Two constants, two drifts and the four of M have eight equations of four frames: one more frame shows the scatter.
-_LEAST_FRAMES = 5
-# Ratio of the smaller to the larger spread of the positions: moves along one line leave M open across it.
-_ONE_LINE = 0.1
-# Probability (two-sided) of a normal deviate beyond 1, for the factor of Student's t on a 1-sigma.
-_ONE_SIGMA = 0.8413
-
-
 @dataclass(frozen=True)
 class StageIsotropy:
     """Size and shape of the pixels against the moves of a stage.
@@ -351,11 +344,11 @@ def fit_stage_moves(
         If there are fewer than five frames, or their positions lie on one line.
     """
     count = len(position_m)
-    if count < _LEAST_FRAMES:
-        raise InvalidValueError(f"{count} positions of the stage", expected=f"{_LEAST_FRAMES}")
+    if count < FRAMES_MIN:
+        raise InvalidValueError(f"{count} positions of the stage", expected=f"{FRAMES_MIN}")
     centred = position_m - position_m.mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False)
-    if not spread[1] > _ONE_LINE * spread[0]:
+    if not spread[1] > ONE_LINE_RATIO * spread[0]:
         raise InvalidValueError(
             "positions of the stage on one line", expected="moves along x and along y"
         )
@@ -376,7 +369,7 @@ def fit_stage_moves(
     unit = matrix / length[:, None]
     skew = float(unit[0] @ unit[1])
     # A few residuals do not tell their own sigma well.
-    wide = float(stdtrit(2 * max(freedom, 1), _ONE_SIGMA))
+    wide = float(stdtrit(2 * max(freedom, 1), ONE_SIGMA))
     sigma = [float(np.sqrt(u @ covariance @ u)) for u in unit]
     across = [
         (unit[1] - skew * unit[0]) / length[0],

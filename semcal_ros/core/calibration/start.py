@@ -32,7 +32,6 @@ from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Mask
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import SMOOTH, refit_functions
 from semcal_ros.core.calibration.estimator.poses import (
-    COARSE,
     adjust,
     initial_values,
     refine_coarsely,
@@ -51,14 +50,23 @@ from semcal_ros.core.calibration.estimator.problem import (
     stack_theta,
     with_coefficients,
 )
+from semcal_ros.core.calibration.estimator.thresholds import COARSE_TOLERANCE
 from semcal_ros.core.calibration.estimator.variance_components import update_components
 from semcal_ros.core.calibration.stage import OFFSET_NAMES, Attitudes, attitudes, stage_rotations
+from semcal_ros.core.calibration.thresholds import (
+    DISPLAY_WIDTH_LIMITS_M,
+    FIRST_UPDATES,
+    SCALE_FACTOR_MAX,
+    START_RHO_MAX,
+    TILTED_RAD,
+    TWICE_OCTAVES,
+    UNTILTED_RAD,
+)
 from semcal_ros.core.calibration.views import GridView, add_excess_noise
 from semcal_ros.core.camera.plane_geometry import fit_homography, view_affine
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 
 __all__ = [
-    "DISPLAY_WIDTH_LIMITS_M",
     "UNTILTED_MODES",
     "Start",
     "adapt_priors",
@@ -77,15 +85,6 @@ __all__ = [
     "with_excess",
 ]
 
-# Display widths of real files are 114 to 519 mm (design, section 3), so a guess from their middle is
-# wrong by 2.1 at most. What is off by more is another unit, or not a microscope; and it is 4 sigmas
-# from the prior of the scale, which would bend everything else.
-_FAR = 3.0
-# In octaves: with the right display width, the scale of a microscope is never this close to a factor
-# of two.
-_TWICE = 0.12
-#: Widths of displays that are accepted, from a chip's to a projector's, m.
-DISPLAY_WIDTH_LIMITS_M = (1e-3, 100.0)
 _UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
 
 
@@ -105,7 +104,7 @@ def observed_scale_factor(views: Sequence[GridView], nominal_px_per_m: Array) ->
 
 def is_scale_far(factor: Array) -> Mask:
     """Return whether ratios of observed to nominal scale are too far from 1 for a calibration."""
-    return (factor < 1.0 / _FAR) | (factor > _FAR)
+    return (factor < 1.0 / SCALE_FACTOR_MAX) | (factor > SCALE_FACTOR_MAX)
 
 
 def advise_scale(
@@ -166,7 +165,7 @@ def check_nominal_scale(
         f"{_format_length(display_width_m)}"
         + (f" and squares of {sides}" if sides else "")
         + " predict",
-        expected=f"a scale within a factor of {_FAR:g} of the predicted one",
+        expected=f"a scale within a factor of {SCALE_FACTOR_MAX:g} of the predicted one",
         do=advise_scale(
             factor,
             display_width_m=display_width_m,
@@ -184,7 +183,7 @@ def check_square_sides(factor: float, display_width_m: float) -> None:
     CalibrationError
         If the ratio of the observed to the nominal scale is about 2 or a half.
     """
-    if abs(abs(np.log2(factor)) - 1.0) >= _TWICE:
+    if abs(abs(np.log2(factor)) - 1.0) >= TWICE_OCTAVES:
         return
     width_m = display_width_m / factor
     raise CalibrationError(
@@ -200,9 +199,6 @@ def _format_length(length_m: float) -> str:
     """Format a length as options take it, such as ``25.1mm``."""
     unit, size_m = next((u for u in _UNITS if length_m >= u[1]), _UNITS[-1])
     return f"{float(f'{length_m / size_m:.4g}'):g}{unit}"
-
-
-_QUARTER = 0.5 * np.pi
 
 
 def align_lattices(setup: Setup) -> Setup:
@@ -222,7 +218,7 @@ def align_lattices(setup: Setup) -> Setup:
         return setup
     # The mean of angles that are known up to quarter turns.
     offset = float(np.angle(np.mean(np.exp(4j * turn[told])))) / 4.0
-    quarters = np.where(told, np.round((turn - offset) / _QUARTER), 0.0).astype(int)
+    quarters = np.where(told, np.round((turn - offset) / (0.5 * np.pi)), 0.0).astype(int)
     views = tuple(_turned(v, int(k)) for v, k in zip(setup.views, quarters, strict=True))
     return replace(setup, views=views, stage_rotation_rad=offset)
 
@@ -245,10 +241,6 @@ def _turned(view: GridView, quarters: int) -> GridView:
 
 
 UNTILTED_MODES = ("auto", "all", "none")
-
-# Apparent tilt below which a view may be untilted: an aspect ratio that is 1 % off looks like 8
-# degrees. Views up to twice as much could be either.
-_FLAT_RAD, _CLEARLY_TILTED_RAD = np.radians(8.0), np.radians(16.0)
 
 
 def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
@@ -293,7 +285,7 @@ def mark_untilted(setup: Setup, untilted: str | Sequence[str]) -> Setup:
 
 def look_untilted(setup: Setup) -> bool:
     """Whether every view looks tilted by no more than an aspect ratio that is not 1 makes it look."""
-    return bool(np.all(_apparent_tilts(setup) < _CLEARLY_TILTED_RAD))
+    return bool(np.all(_apparent_tilts(setup) < TILTED_RAD))
 
 
 def _apparent_tilts(setup: Setup) -> Array:
@@ -310,17 +302,9 @@ def _apparently_untilted(setup: Setup) -> set[int]:
     for own in (np.flatnonzero(visit == j) for j in range(len(groups))):
         least = own[np.argmin(tilt[own])]
         others = own[own != least]
-        if len(others) and tilt[least] < _FLAT_RAD and np.all(tilt[others] > _CLEARLY_TILTED_RAD):
+        if len(others) and tilt[least] < UNTILTED_RAD and np.all(tilt[others] > TILTED_RAD):
             chosen.add(int(least))
     return chosen
-
-
-# Updates of the variance components before anything is selected: they have to be near only, since every later
-# adjustment updates them again.
-_FIRST_UPDATES = 4
-# Largest start of rho, 1/m. The depth gradient of weakly tilted views is noisy, and a pivot nearer
-# than 5 mm would be noise.
-_MAX_START_RHO = 200.0
 
 
 def adapt_priors(setup: Setup) -> Setup:
@@ -380,7 +364,7 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     """Fit moderately flexible functions, poses and variance components from nominal values."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
-    rho = start.rho if start.wide else min(max(start.rho, 0.0), _MAX_START_RHO)
+    rho = start.rho if start.wide else min(max(start.rho, 0.0), START_RHO_MAX)
     functions: Functions = constant_functions(setup, {"scale": start.scale_factor, "rho": rho})
     spread = initial_components(setup)
     problem = build_problem(setup, functions, setup.views, spread)
@@ -392,9 +376,9 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     functions = refit_functions(functions, dict.fromkeys(SMOOTH, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
-    result = adjust(problem, state, tolerance=COARSE)
+    result = adjust(problem, state, tolerance=COARSE_TOLERANCE)
     result = right_way_up(setup, functions, problem, result)
-    for _ in range(_FIRST_UPDATES):
+    for _ in range(FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the
         # scale.
         spread = update_components(setup, problem, result)

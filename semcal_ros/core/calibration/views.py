@@ -27,6 +27,14 @@ from scipy.optimize import brentq
 
 from semcal_ros.core.arrays import MEDIAN_CHI2, AnyImage, Array, Mask, check_positive
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.calibration.thresholds import (
+    LINES_TILT_MAX_RAD,
+    SCALE_WEIGHT,
+    SQUARE_FAR,
+    SQUARE_MISFIT,
+    SQUARE_SCATTER,
+    VARIANCE_RATIO_KEPT,
+)
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
@@ -43,15 +51,6 @@ __all__ = [
     "show_lines",
     "views_from_detections",
 ]
-
-# Relative error of the size of a square that tilt, height, noise and the scale error of the
-# microscope do not explain.
-_MISFIT = 0.12
-# Deviation at which a size counts as wrong, as from a wrong magnification, however far off it is.
-_FAR = 0.3
-
-# Largest tilt that the stage may say of a grating: it shortens the lines' distance by 1.5e-4.
-_FLAT_RAD = np.radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -278,7 +277,7 @@ class SquareAssignment:
     @property
     def misfits(self) -> Mask:
         """(v,) whether the squares of a view have none of the known sizes at its magnification."""
-        return np.abs(np.log(self.apparent_m / self.square_m)) > _MISFIT
+        return np.abs(np.log(self.apparent_m / self.square_m)) > SQUARE_MISFIT
 
 
 def assign_squares(
@@ -309,10 +308,8 @@ def assign_squares(
             offset = float(np.median(observed - sizes[nearest]))
         deviation = np.abs(observed - offset - sizes[nearest])
         # The mean, so that a size with few views is not given up for the others.
-        spread = float(np.mean(np.minimum(deviation, _FAR)))
-        # 0.05: spacings scatter by a few percent (tilt, height); below that the nominal scale
-        # decides.
-        score = max(spread, 0.05) + 0.02 * abs(offset)
+        spread = float(np.mean(np.minimum(deviation, SQUARE_FAR)))
+        score = max(spread, SQUARE_SCATTER) + SCALE_WEIGHT * abs(offset)
         if best is None or score < best[0]:
             best = (score, offset)
     if best is None:
@@ -403,10 +400,6 @@ def views_from_detections(
     return views, assignment
 
 
-# Ratio of observed to stated variances up to which the stated uncertainties are kept.
-_GOOD_ENOUGH = 1.5
-
-
 def estimate_excess_sigma_px(
     views: Sequence[GridView], residuals_px: Array, unknowns: int
 ) -> float:
@@ -432,7 +425,7 @@ def estimate_excess_sigma_px(
         ratio = float(np.median(square / (own + variance)))
         return ratio - target
 
-    if not np.all(np.isfinite(square)) or surplus(0.0) < (_GOOD_ENOUGH - 1.0) * target:
+    if not np.all(np.isfinite(square)) or surplus(0.0) < (VARIANCE_RATIO_KEPT - 1.0) * target:
         return 0.0
     return float(np.sqrt(brentq(surplus, 0.0, float(square.max()) / target + 1e-12)))
 
@@ -459,7 +452,7 @@ def refuse_tilted_lines(views: Sequence[GridView]) -> None:
         return
     for view in views:
         tilt = 0.0 if view.stage is None or view.stage.tilt_rad is None else view.stage.tilt_rad
-        if abs(tilt) > _FLAT_RAD:
+        if abs(tilt) > LINES_TILT_MAX_RAD:
             raise CalibrationError(
                 f"view {view.name}, tilted by {np.degrees(tilt):.1f} degrees, among views of parallel lines",
                 expected="untilted views: what a tilt does to lines in one direction, another scale does as well",

@@ -37,6 +37,7 @@ from semcal_ros.core.corners.thresholds import (
     ARM_LENGTHS,
     ARM_WIDTHS,
     CHESS_SIZES,
+    COMMONEST,
     COMPARABLE_RATIO,
     HARMONIC_ORDERS,
     LINES_OPENING_MIN,
@@ -69,9 +70,6 @@ PATTERN_NAMES = {
     "lines": "crossed lines",
     "grating": "parallel lines",
 }
-
-# What is taken for likely where nothing else decides, first to last.
-_COMMONEST: dict[Pattern, int] = {"chess": 0, "dots": 1, "lines": 1, "crosses": 2}
 
 
 @dataclass(frozen=True)
@@ -153,8 +151,8 @@ class CellShapes:
         """
         ratio = COMPARABLE_RATIO if shape.pattern == "chess" else AMBIGUOUS_RATIO
         if shape.misfit > ratio * self._least.misfit:
-            return len(_COMMONEST), shape.misfit
-        return _COMMONEST[shape.pattern], shape.misfit
+            return len(COMMONEST), shape.misfit
+        return COMMONEST[shape.pattern], shape.misfit
 
     def odds_against(self, pattern: Pattern) -> float:
         """Return how many times as likely the best pattern is; the harmonics have independent, normal errors."""

@@ -811,3 +811,10 @@ UNEVEN_MAX = TABLE.stated(
     "Departure of the lines of a grating from even distances. Seen: rough edges and noise as large as the "
     "contrast 0.013, three lines of a circuit 0.06.",
 )
+
+# Likely patterns, in pattern.py
+
+COMMONEST = TABLE.stated(
+    "COMMONEST", {"chess": 0, "dots": 1, "lines": 1, "crosses": 2}, "order",
+    "What is taken for likely where nothing else decides, first to last.",
+)

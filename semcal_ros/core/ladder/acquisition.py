@@ -43,9 +43,15 @@ from semcal_ros.core.ladder.correspondences import (
 from semcal_ros.core.ladder.extend import scale_of_pictures
 from semcal_ros.core.ladder.matching import LadderPicture, make_predictor
 from semcal_ros.core.ladder.plan import plan_ladder
+from semcal_ros.core.ladder.thresholds import (
+    MOVE_MAX,
+    MOVE_MIN,
+    OFF_CENTRE_MAX,
+    SCAN_ROTATION_OFF_RAD,
+    SHIFT_STEPS,
+)
 
 __all__ = [
-    "MOST_OFF",
     "PictureRequest",
     "TakenPicture",
     "find_offset",
@@ -53,15 +59,6 @@ __all__ = [
     "plan_pictures",
     "take_picture",
 ]
-
-#: Place of the specimen off the middle, as a part of the field, up to which the next magnification shows all of it.
-MOST_OFF = 0.15
-# Moves, as parts of the field, that tell the distortion and leave enough in common: a fifth to a third is asked for.
-_LEAST_MOVE, _MOST_MOVE = 0.1, 0.5
-# Difference from a scan rotation that was asked for that is no longer one of reading.
-_TURN_OFF_RAD = math.radians(5.0)
-# A shift is found where the map between both pictures takes a pixel to the middle: it is smooth.
-_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -186,7 +183,7 @@ def _prepare(picture: LadderPicture) -> Prepared:
 def _inverse(smooth: SmoothMap, wanted: Array) -> Array:
     """The pixel (1, 2) that a map takes to another one, by Newton's method."""
     xy = wanted
-    for _ in range(_STEPS):
+    for _ in range(SHIFT_STEPS):
         xy = xy + np.linalg.solve(smooth.jacobian(xy), (wanted - smooth(xy))[..., None])[..., 0]
     return xy
 
@@ -238,10 +235,10 @@ def take_picture(
     offset = _find_offset_of(model, middle.picture, request, picture)
     field = np.array(picture.image.shape[::-1], dtype=np.float64)
     off = float(np.max(np.abs(offset / field)))
-    if request.is_middle and off > MOST_OFF:
+    if request.is_middle and off > OFF_CENTRE_MAX:
         raise CalibrationError(
             f"the place is off the middle by {100.0 * off:.0f} % of the field",
-            expected=f"{100.0 * MOST_OFF:.0f} % at most",
+            expected=f"{100.0 * OFF_CENTRE_MAX:.0f} % at most",
             do="bring it to the middle",
         )
     moved = float(np.hypot(*(offset / field)))
@@ -250,13 +247,13 @@ def take_picture(
         if request.move == (0.0, 0.0) or asked.move == (0.0, 0.0) or asked.visit != request.visit:
             continue
         assert other.offset_px is not None
-        if np.hypot(*((offset - other.offset_px) / field)) < _LEAST_MOVE:
+        if np.hypot(*((offset - other.offset_px) / field)) < MOVE_MIN:
             raise CalibrationError(
                 "a picture that is moved as the one before",
                 expected="another direction",
                 do="move along the other axis",
             )
-    if request.move != (0.0, 0.0) and not _LEAST_MOVE <= moved <= _MOST_MOVE:
+    if request.move != (0.0, 0.0) and not MOVE_MIN <= moved <= MOVE_MAX:
         raise CalibrationError(
             f"a picture that is moved by {100.0 * moved:.0f} % of the field",
             expected="a fifth to a third",
@@ -269,7 +266,7 @@ def _check_rotation(middle: LadderPicture, request: PictureRequest, picture: Lad
     if middle.scan_rotation_rad is None or picture.scan_rotation_rad is None:
         return
     turned = picture.scan_rotation_rad - middle.scan_rotation_rad
-    if abs(math.remainder(turned - request.turn_rad, 2.0 * math.pi)) > _TURN_OFF_RAD:
+    if abs(math.remainder(turned - request.turn_rad, 2.0 * math.pi)) > SCAN_ROTATION_OFF_RAD:
         raise CalibrationError(
             f"a scan that is turned by {math.degrees(turned):.0f} degrees against that of the picture in the middle",
             expected=f"{math.degrees(request.turn_rad):.0f}",

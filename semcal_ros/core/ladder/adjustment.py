@@ -28,25 +28,32 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from semcal_ros.core.arrays import Array, equilibrate, invert_scaled, solve_scaled
-from semcal_ros.core.calibration.estimator.trust_region import (
-    MIN_DAMPING,
-    Descent,
-    DescentStatus,
-    Step,
-    descend,
-)
+from semcal_ros.core.calibration.estimator.thresholds import DAMPING_MIN
+from semcal_ros.core.calibration.estimator.trust_region import Descent, DescentStatus, Step, descend
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.residuals import Link, pair_rows, pair_values
-from semcal_ros.core.ladder.unknowns import (
+from semcal_ros.core.ladder.thresholds import (
+    CREEP_SIGMA,
+    DRIFT_FIRST_PX,
+    DRIFT_MAX,
+    DRIFT_MIN_PX,
+    DRIFT_ROUNDS,
+    DRIFTS_TRIED,
+    FIT_STEPS,
+    FIT_TOLERANCE,
+    GAUGE,
+    JUMP_GAIN,
+    JUMPS_MAX,
+    LINK_FACTOR,
     POSE_SIZE,
-    LadderSetup,
-    LadderState,
-    jump_sigmas,
-    slope_sigma,
+    SETTLED_DRIFT_PX,
+    TURNED_RAD,
+    UNEXPLAINED_RATIO,
+    VIBRATION_PX,
 )
+from semcal_ros.core.ladder.unknowns import LadderSetup, LadderState, jump_sigmas, slope_sigma
 
 __all__ = [
-    "SETTLED_DRIFT_PX",
     "DriftSpread",
     "LadderFit",
     "add_up",
@@ -54,31 +61,6 @@ __all__ = [
     "prior_information",
     "share_noise",
 ]
-
-# Gauss-Newton steps; from the poses of the correspondences five are enough.
-_ITERATIONS, _TOLERANCE = 30, 1e-9
-# Spreads of the drift in a frame of the finest magnification that are tried, px: a tenth of a pixel is what a stage
-# that has settled does, and more than a thirtieth of the picture is no drift.
-_FIRST_DRIFT_PX, _LEAST_DRIFT_PX, _MOST_DRIFT = 0.5, 0.02, 0.03
-_SPREADS, _SPREAD_ROUNDS = 12, 3
-#: A spread of the drift that a settled specimen may have, px.
-SETTLED_DRIFT_PX = 1.0
-# By how much a larger one must lower the variance of the residuals to be believed: what else is not in the model lowers
-# it by a few per cent.
-_UNEXPLAINED = 1.1
-# Scans whose angle differs by less are not turned, rad.
-_TURNED_RAD = 0.5
-# Vibration stretches a frame by this at any magnification, px.
-_LEAST_CHANGE_PX = 0.01
-# A jump must lower twice the cost by this: by chance, one of 12 places does so in 1 of 10 000 ladders.
-_JUMP_GAIN = 20.0
-_MOST_JUMPS = 4
-# The first picture has its place: its turn (rad) and shift (px) are fixed to these.
-_GAUGE = (1e-9, 1e-7)
-# 1-sigma of the change of the scale from a picture to the next: of 28 pictures, 3 % over all of them.
-_CREEP_SIGMA = 1e-3
-# Links whose mean square residual exceeds that of the others by this factor are left out: chance makes 2.
-_BAD_LINK = 9.0
 
 
 @dataclass(frozen=True)
@@ -137,7 +119,7 @@ def drift_sigmas(setup: LadderSetup, drift_sigma_px: float) -> Array:
     A specimen drifts by as many metres at all magnifications.
     """
     magnifications = np.array([picture.magnification for picture in setup.pictures])
-    return np.hypot(drift_sigma_px * magnifications / magnifications.max(), _LEAST_CHANGE_PX)
+    return np.hypot(drift_sigma_px * magnifications / magnifications.max(), VIBRATION_PX)
 
 
 def prior_information(setup: LadderSetup, drift: DriftSpread, jumps: tuple[int, ...]) -> Array:
@@ -149,13 +131,13 @@ def prior_information(setup: LadderSetup, drift: DriftSpread, jumps: tuple[int, 
     information[steps] = 1.0 / jump_sigmas(setup, jumps) ** 2
     information[visits] = 1.0 / setup.visit_sigma**2
     information[slopes] = 1.0 / slope_sigma() ** 2
-    information[creep] = 1.0 / _CREEP_SIGMA**2
+    information[creep] = 1.0 / CREEP_SIGMA**2
     own = information[poses].reshape(-1, POSE_SIZE)
     own[:, 3:] = drift_sigmas(setup, drift.change_px)[:, None] ** -2
     for visit, spread in zip(setup.visit_of, drift_sigmas(setup, drift.steady_px), strict=True):
         start = drifts.start + 2 * int(visit)
         information[start : start + 2] = spread**-2
-    own[0, 0], own[0, 1:3] = _GAUGE[0] ** -2, _GAUGE[1] ** -2
+    own[0, 0], own[0, 1:3] = GAUGE[0] ** -2, GAUGE[1] ** -2
     information[poses] = own.ravel()
     return information
 
@@ -216,11 +198,11 @@ def adjust(
     CalibrationError
         If the adjustment does not converge.
     """
-    fit = _adjust(setup, state, links, on_progress, _MOST_DRIFT * setup.image_size[1])
+    fit = _adjust(setup, state, links, on_progress, DRIFT_MAX * setup.image_size[1])
     if max(fit.drift.steady_px, fit.drift.change_px) <= SETTLED_DRIFT_PX:
         return fit
     settled = _adjust(setup, state, links, on_progress, SETTLED_DRIFT_PX)
-    is_as_good = settled.variance_factor <= _UNEXPLAINED * fit.variance_factor
+    is_as_good = settled.variance_factor <= UNEXPLAINED_RATIO * fit.variance_factor
     return settled if is_as_good and len(settled.kept) >= len(fit.kept) else fit
 
 
@@ -234,7 +216,7 @@ def _adjust(
     """Adjust with a spread of the drift of at most so many px."""
     jumps: tuple[int, ...] = ()
     kept = tuple(range(len(links)))
-    first = min(_FIRST_DRIFT_PX, most_drift_px)
+    first = min(DRIFT_FIRST_PX, most_drift_px)
     drift = DriftSpread(first, first)
     while True:
         used = share_noise(setup, [links[k] for k in kept])
@@ -243,14 +225,14 @@ def _adjust(
         matrix, right, squares = add_up(state, used)
         found = (
             None
-            if len(jumps) == _MOST_JUMPS
+            if len(jumps) == JUMPS_MAX
             else _find_jump(setup, state, matrix, right, drift, jumps)
         )
         if found is not None:
             jumps = tuple(sorted((*jumps, found)))
             continue
         factors = squares / np.array([2.0 * len(link) for link in used])
-        bad = factors > _BAD_LINK * float(np.median(factors))
+        bad = factors > LINK_FACTOR * float(np.median(factors))
         if not np.any(bad):
             break
         kept = tuple(k for k, wrong in zip(kept, bad, strict=True) if not wrong)
@@ -282,7 +264,7 @@ def _settle(
     most_drift_px: float,
 ) -> tuple[LadderState, DriftSpread, Descent[LadderState]]:
     """Adjust, with the spread of the drift within the frames."""
-    for _ in range(_SPREAD_ROUNDS):
+    for _ in range(DRIFT_ROUNDS):
         descent = _descend(setup, state, links, drift, jumps)
         state, before = descent.state, drift
         matrix, right, _ = add_up(state, links)
@@ -307,7 +289,7 @@ def _most_likely_drift(
     spread moves the unknowns by little, so that the equations of the pictures stay as they are. All spreads are tried,
     since there may be more than one minimum.
     """
-    spreads = np.geomspace(_LEAST_DRIFT_PX, most_drift_px, _SPREADS).tolist()
+    spreads = np.geomspace(DRIFT_MIN_PX, most_drift_px, DRIFTS_TRIED).tolist()
     # Without a turned scan a steady drift is a stretch of the camera, and its spread is that of the changes.
     steady = spreads if _has_turns(setup, state) else [None]
     best, least = DriftSpread(spreads[0], spreads[0]), np.inf
@@ -333,7 +315,7 @@ def _has_turns(setup: LadderSetup, state: LadderState) -> bool:
     turned = 0
     for visit in range(len(setup.visits)):
         own = angles[setup.visit_of == visit]
-        turned += bool(np.any(np.abs(np.angle(np.exp(1j * (own - own[0])))) > _TURNED_RAD))
+        turned += bool(np.any(np.abs(np.angle(np.exp(1j * (own - own[0])))) > TURNED_RAD))
     return 3 * turned >= len(setup.visits)
 
 
@@ -379,10 +361,10 @@ def _descend(
         state,
         cost_of(state),
         linearise,
-        max_iterations=_ITERATIONS,
-        tolerance=_TOLERANCE,
+        max_iterations=FIT_STEPS,
+        tolerance=FIT_TOLERANCE,
         # The correspondences give poses to a fraction of a pixel, from where the problem is nearly linear.
-        first_damping=MIN_DAMPING,
+        first_damping=DAMPING_MIN,
     )
 
 
@@ -415,4 +397,4 @@ def _find_jump(
         score = right[column] - float(half @ np.linalg.solve(factor, scale * gradient[rest]))
         gains.append(score**2 / curvature if curvature > 0.0 else 0.0)
     best = int(np.argmax(gains))
-    return free[best] if gains[best] > _JUMP_GAIN else None
+    return free[best] if gains[best] > JUMP_GAIN else None

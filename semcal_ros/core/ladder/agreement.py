@@ -29,13 +29,21 @@ from scipy import stats
 
 from semcal_ros.core.arrays import equilibrate
 from semcal_ros.core.ladder.adjustment import LadderFit, add_up, prior_information, share_noise
-from semcal_ros.core.ladder.matching import ONE_SETTING, Match
+from semcal_ros.core.ladder.matching import Match
 from semcal_ros.core.ladder.residuals import Link
+from semcal_ros.core.ladder.thresholds import (
+    BACK_PART,
+    DEVIATION_MIN,
+    DISAGREEMENT_FALSE_ALARMS,
+    LINK_FACTOR,
+    SETTING_RATIO,
+    TOLD_PART,
+    VISIT_SIGMAS,
+)
 from semcal_ros.core.ladder.unknowns import LadderSetup
 
 __all__ = [
     "FLIPS",
-    "SURE",
     "Disagreement",
     "Flip",
     "Misstatement",
@@ -44,19 +52,6 @@ __all__ = [
     "measure_disagreement",
     "minus_log_evidence",
 ]
-
-# Directions of the prior of which the pictures tell less than this part of the variance are not asked.
-_TOLD = 0.05
-# A calibration that still holds is said to disagree in one of 10 000 ladders.
-_FALSE_ALARM = 1e-4
-#: Difference of minus twice the logarithm of the evidence of which one of three million is chance.
-SURE = 30.0
-# What a pair that was left out costs, in squares of sigmas per residual: the limit at which it is.
-_LEFT_OUT = 9.0
-# The scale is back if it goes back by this part of a step, or by the inverse: its functions bend by less in a step.
-_BACK = 0.65
-# Sigmas of the repeatability, and least relative deviation, of a visit that is not the repeatability's.
-_VISIT_SIGMAS, _LEAST_DEVIATION = 6.0, 3e-3
 
 
 @dataclass(frozen=True)
@@ -117,7 +112,9 @@ class Disagreement:
     @property
     def is_chance(self) -> bool:
         """Whether a calibration that still holds shows as much."""
-        return self.chi_square <= float(stats.chi2.isf(_FALSE_ALARM, max(self.freedom, 1)))
+        return self.chi_square <= float(
+            stats.chi2.isf(DISAGREEMENT_FALSE_ALARMS, max(self.freedom, 1))
+        )
 
 
 def measure_disagreement(setup: LadderSetup, fit: LadderFit) -> Disagreement:
@@ -129,7 +126,7 @@ def measure_disagreement(setup: LadderSetup, fit: LadderFit) -> Disagreement:
     own = setup.bounds[0]
     components, covariance = fit.state.values[own], fit.covariance[own, own]
     expected, directions = np.linalg.eigh(np.eye(len(components)) - covariance)
-    told = expected > _TOLD
+    told = expected > TOLD_PART
     change = directions.T @ components
     return Disagreement(
         float(np.sum(change[told] ** 2 / expected[told])), int(np.count_nonzero(told))
@@ -152,7 +149,7 @@ def minus_log_evidence(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]
     total += float(np.dot([link.share for link in used], squares))
     full = share_noise(setup, links)
     left_out = set(range(len(links))) - set(fit.kept)
-    return total + sum(_LEFT_OUT * full[k].share * 2.0 * len(full[k]) for k in left_out)
+    return total + sum(LINK_FACTOR * full[k].share * 2.0 * len(full[k]) for k in left_out)
 
 
 @dataclass(frozen=True)
@@ -190,10 +187,10 @@ def find_misstatement(setup: LadderSetup, fit: LadderFit) -> Misstatement | None
     for number in fit.jumps:
         low, high = setup.intervals[number]
         step = scales[high] - scales[low]
-        if abs(step) < _LEAST_DEVIATION:
+        if abs(step) < DEVIATION_MIN:
             continue
         k = levels.index(low)
-        if high < ONE_SETTING * low:
+        if high < SETTING_RATIO * low:
             fewer = low if counts[low] < counts[high] else high
             found.append(Misstatement(fewer, step if fewer == high else -step))
         elif k + 2 < len(levels) and _is_back(scales[levels[k + 2]] - scales[high], step):
@@ -209,12 +206,14 @@ def _misstated_visits(setup: LadderSetup, fit: LadderFit) -> list[Misstatement]:
     own = fit.state.values[setup.bounds[3]]
     magnifications = np.empty(len(own))
     magnifications[setup.visit_of] = [picture.magnification for picture in setup.pictures]
-    limit = max(_VISIT_SIGMAS * setup.visit_sigma, _LEAST_DEVIATION)
+    limit = max(VISIT_SIGMAS * setup.visit_sigma, DEVIATION_MIN)
     found = []
     for number in np.flatnonzero(np.abs(own) > limit):
         g = float(magnifications[number])
         # Others of the same setting have taken a part of it.
-        others = (np.abs(np.log(magnifications / g)) < np.log(ONE_SETTING)) & (magnifications != g)
+        others = (np.abs(np.log(magnifications / g)) < np.log(SETTING_RATIO)) & (
+            magnifications != g
+        )
         deviation = own[number] - (float(np.mean(own[others])) if np.any(others) else 0.0)
         found.append(Misstatement(g, float(deviation)))
     return found
@@ -222,4 +221,4 @@ def _misstated_visits(setup: LadderSetup, fit: LadderFit) -> list[Misstatement]:
 
 def _is_back(other: float, step: float) -> bool:
     """Whether the scale goes back by what it went before, or after."""
-    return _BACK < -other / step < 1.0 / _BACK
+    return BACK_PART < -other / step < 1.0 / BACK_PART

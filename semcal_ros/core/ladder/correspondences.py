@@ -34,6 +34,28 @@ from scipy import ndimage
 
 from semcal_ros.core.arrays import Array, Image, Mask, mad_sigma
 from semcal_ros.core.errors import Rejection
+from semcal_ros.core.ladder.thresholds import (
+    BLOCK_SIGMA_MAX_PX,
+    BLOCK_SIGMAS,
+    BLOCK_STEP_MAX_PX,
+    BLOCKS_AGREEING_MIN,
+    BLOCKS_MIN,
+    COARSE_DEGREE,
+    COARSE_FACTORS,
+    COARSE_PASSES,
+    CORRELATION_MIN,
+    FINE_DEGREE,
+    FINE_PASSES,
+    GAIN_MAX,
+    GAIN_MIN,
+    INTERPOLATION_PX,
+    LAST_STEP_PX,
+    OVERLAP_MIN,
+    PIXEL_SIGMA,
+    SECOND_PEAK_MAX,
+    SIGNAL_MIN,
+    TILES,
+)
 from semcal_ros.core.registration.noise_spectrum import (
     ImageStatistics,
     measure_image,
@@ -59,39 +81,6 @@ __all__ = [
     "locate_picture",
     "match_pictures",
 ]
-
-# Of the smaller picture, that must overlap where the place is searched.
-_LEAST_OVERLAP = 0.12
-# A second peak as high as this part of the highest, farther off than its width: the specimen may repeat.
-_AMBIGUOUS = 0.9
-# Displacements are measured at these reductions first, with a linear map: a third of a degree displaces the corner
-# of 384 px by 1.6 px, which a reduced picture sees as less than a pixel.
-_COARSE_FACTORS = (4, 2)
-_COARSE_DEGREE, _FINE_DEGREE = 1, 4
-_COARSE_PASSES, _FINE_PASSES = 3, 4
-# The last step of the map, px RMS: half of what interpolation leaves.
-_SETTLED_PX = 0.004
-# What interpolation leaves of a displacement, px: measured on noiseless textures.
-_FLOOR_PX = 0.003
-# Tiles of a block along each side.
-_TILES = 2
-# Of a block's gradient energy, that must be more than noise.
-_LEAST_SIGNAL = 0.25
-_LEAST_GAIN, _MOST_GAIN = 0.2, 5.0
-# Blocks whose place is not known better than this say nothing, px.
-_MOST_SIGMA_PX = 0.5
-# Robust standard deviations of blocks about the smooth map beyond which they show something else: of a thousand blocks
-# none is so far off by chance.
-_OUTLIER_SIGMAS = 5.0
-# Of the blocks, that must agree with one smooth map: dust may move, but where a third does, nothing says which.
-_LEAST_SHARE = 0.7
-# A displacement longer than this at the finest resolution is none that least squares has found, px.
-_MOST_STEP_PX = 1.5
-# A map of the fourth degree has 15 coefficients.
-_LEAST_BLOCKS = 24
-_LEAST_CORRELATION = 0.3
-# Sigma of beam and pixel together in px of either picture: half a pixel, to which a microscope is focused.
-_PIXEL_SIGMA = 0.5
 
 
 class PairFailure(Enum):
@@ -211,7 +200,7 @@ class Prepared:
     @cached_property
     def coarse(self) -> CoarseReference:
         """Its side of the search over all shifts."""
-        return CoarseReference(self.pyramid, _LEAST_OVERLAP)
+        return CoarseReference(self.pyramid, OVERLAP_MIN)
 
     @cached_property
     def periods(self) -> Array:
@@ -286,22 +275,22 @@ def match_pictures(
     if isinstance(found, Rejection):
         return found
     smooth = found
-    for factor in _COARSE_FACTORS:
-        for _ in range(_COARSE_PASSES):
+    for factor in COARSE_FACTORS:
+        for _ in range(COARSE_PASSES):
             blocks = _measure_blocks(first, second, smooth, factor)
             if blocks is None or len(blocks.xy) < 6:
                 break
-            step = _fit_step(blocks, first.size, _COARSE_DEGREE)
+            step = _fit_step(blocks, first.size, COARSE_DEGREE)
             smooth = _follow(smooth, step)
             if step.rms_px < 0.05 * factor:
                 break
     blocks = None
-    for number in range(_FINE_PASSES):
+    for number in range(FINE_PASSES):
         blocks = _measure_blocks(first, second, smooth, 1)
-        if blocks is None or len(blocks.xy) < _LEAST_BLOCKS:
+        if blocks is None or len(blocks.xy) < BLOCKS_MIN:
             return Rejection(PairFailure.NO_OVERLAP, "too little in common, or another place")
-        step = _fit_step(blocks, first.size, 2 if number == 0 else _FINE_DEGREE)
-        if number == _FINE_PASSES - 1 or (number > 0 and step.rms_px < _SETTLED_PX):
+        step = _fit_step(blocks, first.size, 2 if number == 0 else FINE_DEGREE)
+        if number == FINE_PASSES - 1 or (number > 0 and step.rms_px < LAST_STEP_PX):
             break
         smooth = _follow(smooth, step)
     assert blocks is not None
@@ -334,7 +323,7 @@ def _fit_prediction(predict: Callable[[Array], Array], size: tuple[int, int]) ->
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     mapped = predict(xy)
     known = np.all(np.isfinite(mapped), axis=1)
-    return SmoothMap.fit(xy[known], mapped[known], size, _FINE_DEGREE)
+    return SmoothMap.fit(xy[known], mapped[known], size, FINE_DEGREE)
 
 
 def _follow(smooth: SmoothMap, step: _Step) -> SmoothMap:
@@ -343,7 +332,7 @@ def _follow(smooth: SmoothMap, step: _Step) -> SmoothMap:
     x, y = np.meshgrid(np.linspace(0, width - 1, 13), np.linspace(0, height - 1, 13))
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     moved = smooth(xy + step.map(xy))
-    return SmoothMap.fit(xy, moved, smooth.size, _FINE_DEGREE)
+    return SmoothMap.fit(xy, moved, smooth.size, FINE_DEGREE)
 
 
 def _scale_of(smooth: SmoothMap) -> float:
@@ -353,7 +342,7 @@ def _scale_of(smooth: SmoothMap) -> float:
 
 def _blurred(second: Prepared, scale: float) -> Image:
     """The finer picture with the resolution of the coarser one."""
-    sigma = _PIXEL_SIGMA * np.sqrt(max(scale**2 - 1.0, 0.0))
+    sigma = PIXEL_SIGMA * np.sqrt(max(scale**2 - 1.0, 0.0))
     image = second.image.astype(np.float32)
     if sigma < 0.1:
         return image
@@ -390,7 +379,7 @@ def _search(
     if not peaks:
         return Rejection(PairFailure.NO_OVERLAP, "no shift at which both show the same")
     best = peaks[0]
-    if best.correlation < _LEAST_CORRELATION and not best.significant:
+    if best.correlation < CORRELATION_MIN and not best.significant:
         return Rejection(
             PairFailure.NO_OVERLAP, f"they correlate by {best.correlation:.2f} at most"
         )
@@ -398,7 +387,7 @@ def _search(
         peak
         for peak in peaks[1:]
         if np.max(np.abs(np.subtract(peak.shift_px, best.shift_px))) > 4.0 * best.step_px
-        and peak.correlation > _AMBIGUOUS * best.correlation
+        and peak.correlation > SECOND_PEAK_MAX * best.correlation
     ]
     if others and len(first.periods):
         return Rejection(
@@ -460,17 +449,17 @@ def _measure_blocks(
         return None
     sums = tile_sums(level, window, image.centred(factor), np.zeros(2), np.zeros((2, 2)))
     normal = level.normal_matrices[window.rows, window.cols]
-    count = [n // _TILES for n in normal.shape[:2]]
+    count = [n // TILES for n in normal.shape[:2]]
     if min(count) < 1:
         return None
 
     def gather(values: Array) -> Array:
-        cut = values[: count[0] * _TILES, : count[1] * _TILES]
-        shape = (count[0], _TILES, count[1], _TILES, *values.shape[2:])
+        cut = values[: count[0] * TILES, : count[1] * TILES]
+        shape = (count[0], TILES, count[1], TILES, *values.shape[2:])
         summed = cut.reshape(shape).sum(axis=(1, 3))
         return np.asarray(summed.reshape(count[0] * count[1], *values.shape[2:]))
 
-    side = np.array(level.side) * _TILES
+    side = np.array(level.side) * TILES
     x = level.origin[0] + window.cols.start * level.side[0] + side[0] * np.arange(count[1])
     y = level.origin[1] + window.rows.start * level.side[1] + side[1] * np.arange(count[0])
     known = np.array(
@@ -489,8 +478,8 @@ def _measure_blocks(
     xy = (np.stack([middle_x.ravel(), middle_y.ravel()], axis=1) + 0.5) * factor - 0.5
     blocks = _solve_blocks(first, level, gather(normal), gather(sums.cross), gather(sums.energy))
     keep = known & np.all(np.isfinite(blocks.shift), axis=1)
-    keep &= np.sqrt(np.einsum("nii->n", blocks.covariance)) < _MOST_SIGMA_PX
-    keep &= np.hypot(*blocks.shift.T) < 2.0 * _MOST_STEP_PX
+    keep &= np.sqrt(np.einsum("nii->n", blocks.covariance)) < BLOCK_SIGMA_MAX_PX
+    keep &= np.hypot(*blocks.shift.T) < 2.0 * BLOCK_STEP_MAX_PX
     return _Blocks(
         xy[keep],
         factor * blocks.shift[keep],
@@ -513,7 +502,7 @@ def _solve_blocks(
     signal = np.einsum("nii->ni", clean)[:, :3] / np.maximum(
         np.einsum("nii->ni", normal)[:, :3], 1e-30
     )
-    good = np.all(signal > _LEAST_SIGNAL, axis=1)
+    good = np.all(signal > SIGNAL_MIN, axis=1)
     shift = np.full((len(normal), 2), np.nan)
     covariance = np.full((len(normal), 2, 2), np.inf)
     centred = normal[:, 2, 2] - normal[:, 2, 3] ** 2 / pixels
@@ -528,7 +517,7 @@ def _solve_blocks(
             continue
         gain = values[2]
         spread = np.diag(inverse)[:2]
-        if not (_LEAST_GAIN < gain < _MOST_GAIN and np.all(spread > 0.0)):
+        if not (GAIN_MIN < gain < GAIN_MAX and np.all(spread > 0.0)):
             continue
         shift[k] = -values[:2] / gain
         plain = np.linalg.solve(normal[k], cross[k])
@@ -539,7 +528,7 @@ def _solve_blocks(
 
 def _fit_step(blocks: _Blocks, size: tuple[int, int], degree: int) -> _Step:
     """Fit a smooth displacement to blocks, without those that do not follow."""
-    weights = 1.0 / (np.einsum("nii->n", blocks.covariance) + _FLOOR_PX**2)
+    weights = 1.0 / (np.einsum("nii->n", blocks.covariance) + INTERPOLATION_PX**2)
     inside = np.ones(len(blocks.xy), dtype=bool)
     for _ in range(4):
         fitted = SmoothMap.fit(
@@ -548,7 +537,7 @@ def _fit_step(blocks: _Blocks, size: tuple[int, int], degree: int) -> _Step:
         residual = blocks.shift - fitted(blocks.xy)
         scaled = residual * np.sqrt(weights)[:, None]
         spread = max(mad_sigma(scaled[inside]), 1e-12)
-        now = np.all(np.abs(scaled) < _OUTLIER_SIGMAS * spread, axis=1)
+        now = np.all(np.abs(scaled) < BLOCK_SIGMAS * spread, axis=1)
         if np.count_nonzero(now) < 2 * (degree + 1) * (degree + 2) // 2 or np.array_equal(
             now, inside
         ):
@@ -565,14 +554,14 @@ def _conclude(
     inside = step.inside
     share = float(np.mean(inside))
     correlation = float(np.median(blocks.correlation[inside]))
-    if correlation < _LEAST_CORRELATION:
+    if correlation < CORRELATION_MIN:
         return Rejection(PairFailure.NO_OVERLAP, f"blocks that correlate by {correlation:.2f}")
-    if share < _LEAST_SHARE:
+    if share < BLOCKS_AGREEING_MIN:
         return Rejection(
             PairFailure.INCONSISTENT,
             f"{100.0 * (1.0 - share):.0f} % of the blocks do not move with the rest",
         )
-    covariance = blocks.covariance[inside] + _FLOOR_PX**2 * np.eye(2)
+    covariance = blocks.covariance[inside] + INTERPOLATION_PX**2 * np.eye(2)
     residual = step.residual[inside]
     root = np.linalg.cholesky(np.linalg.inv(covariance))
     scaled = np.einsum("nji,nj->ni", root, residual)

@@ -34,10 +34,9 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
 from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.core.ladder.adjustment import SETTLED_DRIFT_PX, LadderFit, adjust
+from semcal_ros.core.ladder.adjustment import LadderFit, adjust
 from semcal_ros.core.ladder.agreement import (
     FLIPS,
-    SURE,
     Flip,
     Misstatement,
     find_misstatement,
@@ -57,8 +56,20 @@ from semcal_ros.core.ladder.matching import (
     match_all,
 )
 from semcal_ros.core.ladder.residuals import Link, camera_of, make_link, pair_rows
-from semcal_ros.core.ladder.unknowns import (
+from semcal_ros.core.ladder.thresholds import (
+    CREEP_MAX,
+    CREEP_SIGMAS,
+    EVIDENCE_SURE,
+    LINKS_USED_MIN,
+    NAMED_MAX,
     POSE_SIZE,
+    SETTLED_DRIFT_PX,
+    STEEPEST_RAD,
+    TURNED_RAD,
+    VARIANCE_FACTOR_MAX,
+    VARIANCE_FACTOR_NOTED,
+)
+from semcal_ros.core.ladder.unknowns import (
     LadderSetup,
     LadderState,
     PicturePlace,
@@ -82,21 +93,6 @@ __all__ = [
     "measure_ladder",
     "scale_of_pictures",
 ]
-
-# Slope of a specimen that is not flat any more: 5 degrees, ten times that of one that is mounted flat.
-_STEEPEST_RAD = 0.0873
-# Residuals of twice their sigma are a model that does not fit, or pictures that do not show one plane.
-_LARGEST_FACTOR = 4.0
-# A thousand residuals or more have a mean square within 0.15 of 1; interpolation and jitter of lines add some.
-_NOTED_FACTOR = 1.25
-_LEAST_USED = 0.5
-# A creep of so many sigmas is one of 16 000 by chance; what adds up to more than this over a ladder need not be as
-# steady as it is taken to be.
-_CREEP_SIGMAS, _MOST_CREEP = 4.0, 5e-3
-# Pictures that are named.
-_MOST_NAMED = 3
-# A turn by less than this is none of the scan, rad; and a shift by less than this part of the field is none.
-_TURNED_RAD, _SHIFTED = 0.5, 0.08
 
 
 @dataclass(frozen=True)
@@ -384,7 +380,7 @@ def _adjust_as_they_lie(
     as_it_is = np.inf if fitted is None else fitted.minus_log_evidence
     others = [(_adjust_flipped(ladder, used, matches, flip), flip) for flip in FLIPS]
     least, likely = min(others, key=lambda one: one[0])
-    if least < as_it_is - SURE:
+    if least < as_it_is - EVIDENCE_SURE:
         raise CalibrationError(
             f"pictures that are {likely.name} against those of the calibration: its distortion fits them only so",
             expected="pictures as the microscope showed them when it was calibrated",
@@ -393,7 +389,7 @@ def _adjust_as_they_lie(
     if fitted is None:
         assert failure is not None
         raise failure
-    if opposite and min(cost for cost, flip in others if flip.is_mirror) < as_it_is + SURE:
+    if opposite and min(cost for cost, flip in others if flip.is_mirror) < as_it_is + EVIDENCE_SURE:
         notes[-1] += ", or all pictures are mirrored, which their distortion does not tell"
     return fitted, notes
 
@@ -422,8 +418,8 @@ def _leave_out(
     """
     kept = [ladder.places[k].magnification for k in used if k not in own]
     other = "larger" if wrong.deviation > 0.0 else "smaller"
-    names = ", ".join(ladder.places[k].name for k in own[:_MOST_NAMED])
-    names += f" and {len(own) - _MOST_NAMED} more" if len(own) > _MOST_NAMED else ""
+    names = ", ".join(ladder.places[k].name for k in own[:NAMED_MAX])
+    names += f" and {len(own) - NAMED_MAX} more" if len(own) > NAMED_MAX else ""
     seen = (
         f"{counted(len(own), 'picture')} at {wrong.magnification:g}x ({names}) whose magnification the others show to "
         f"be {100.0 * abs(wrong.deviation):.2g} % {other}"
@@ -628,7 +624,7 @@ def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None
         With what was seen.
     """
     share = len(fit.kept) / len(links)
-    if share < _LEAST_USED or fit.variance_factor > _LARGEST_FACTOR:
+    if share < LINKS_USED_MIN or fit.variance_factor > VARIANCE_FACTOR_MAX:
         raise CalibrationError(
             f"pairs of pictures that disagree by {np.sqrt(fit.variance_factor):.1f} times what they state, "
             f"{100.0 * (1.0 - share):.0f} % of them left out",
@@ -636,18 +632,18 @@ def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None
             do="use a flat specimen that neither charges nor moves, and wait until the drift has settled",
         )
     tilt, sigma = _tilt(setup, fit)
-    if tilt > _STEEPEST_RAD and tilt > 3.0 * sigma:
+    if tilt > STEEPEST_RAD and tilt > 3.0 * sigma:
         raise CalibrationError(
             f"a specimen that is tilted by {np.degrees(tilt):.1f} degrees",
-            expected=f"one that lies flat, to {np.degrees(_STEEPEST_RAD):.0f} degrees",
+            expected=f"one that lies flat, to {np.degrees(STEEPEST_RAD):.0f} degrees",
             do="untilt the stage, and record the ladder again",
         )
     creep, creep_sigma = creep_of(setup, fit)
     pictures = len(setup.pictures)
-    if abs(creep) > _CREEP_SIGMAS * creep_sigma and abs(creep) * pictures > _MOST_CREEP:
+    if abs(creep) > CREEP_SIGMAS * creep_sigma and abs(creep) * pictures > CREEP_MAX:
         raise CalibrationError(
             f"a scale that creeps by {100.0 * creep:+.3f} +- {100.0 * creep_sigma:.3f} % from picture to picture",
-            expected=f"less than {100.0 * _MOST_CREEP:g} % over all {pictures} pictures",
+            expected=f"less than {100.0 * CREEP_MAX:g} % over all {pictures} pictures",
             do="use a specimen that does not charge, and wait until the microscope has settled",
         )
     linked = {number for k in fit.kept for number in (links[k].first, links[k].second)}
@@ -776,7 +772,7 @@ def describe_steps(measured: LadderMeasurement) -> tuple[LadderStep, ...]:
     for g in levels:
         numbers = [k for k, picture in enumerate(setup.pictures) if picture.magnification == g]
         angles = np.array([fit.state.poses[k, 0] for k in numbers])
-        turned = np.abs(np.angle(np.exp(1j * (angles - angles[0])))) > _TURNED_RAD
+        turned = np.abs(np.angle(np.exp(1j * (angles - angles[0])))) > TURNED_RAD
         rms = np.sqrt(np.mean(np.concatenate(squares[g]) ** 2)) if squares[g] else 0.0
         steps.append(
             LadderStep(g, len(numbers), int(np.count_nonzero(turned)), own[g], below[g], float(rms))
@@ -795,13 +791,13 @@ def find_unrest(measured: LadderMeasurement) -> tuple[str, ...]:
             f"pictures agree only with a drift within a frame of {drift_px:.1f} px (1-sigma) at {last:g}x: the "
             "specimen has not settled, or something that is fixed to the scan, and no drift, distorts them"
         )
-    if fit.variance_factor > _NOTED_FACTOR:
+    if fit.variance_factor > VARIANCE_FACTOR_NOTED:
         found.append(
             f"pictures disagree by {np.sqrt(fit.variance_factor):.1f} times what their noise explains, which the "
             "stated uncertainty contains: a part of the specimen moves, it charges, or it is not flat"
         )
     creep, sigma = creep_of(setup, fit)
-    if abs(creep) > _CREEP_SIGMAS * sigma:
+    if abs(creep) > CREEP_SIGMAS * sigma:
         found.append(
             f"the scale creeps by {100.0 * creep:+.3f} +- {100.0 * sigma:.3f} % from picture to picture, which was "
             "taken out: the specimen charges, or the microscope has not settled"

@@ -43,11 +43,22 @@ from semcal_ros.core.ladder.extend import (
     make_model,
     measure_ladder,
 )
-from semcal_ros.core.ladder.matching import (
-    LARGEST_STEP,
-    LadderPicture,
-    RejectedPair,
-    check_steps,
+from semcal_ros.core.ladder.matching import LadderPicture, RejectedPair, check_steps
+from semcal_ros.core.ladder.thresholds import (
+    CONSTANT_SIGMAS,
+    HEIGHT_SIGMA_M,
+    LENGTH_MIN_PX,
+    MAGNIFICATIONS_MIN,
+    ONE_ROTATION_COS,
+    PIVOT,
+    PIVOT_SIGMA,
+    POINTED_SIGMA_PX,
+    PRINCIPAL_POINT,
+    REPEATABILITY,
+    SCALE_HELD,
+    SLOPE_SIGMAS,
+    STAGE_SIGMA_MAX,
+    STEP_MAX,
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup
 
@@ -62,33 +73,6 @@ __all__ = [
 
 #: The method of the calibration, as its file says it.
 METHOD = "specimen"
-# The lowest two magnifications are where the functions begin: constants and slopes there, bends beyond.
-_LEAST_MAGNIFICATIONS = 3
-# Prior 1-sigma of the constants: those of an instrument that nobody knows; relative, in normalised coordinates, or, of
-# centres, in image widths.
-_CONSTANTS = {"aspect": 0.01, "skew": 0.01, "xi_r": 0.03, "xi_t": 0.01, "ex": 0.08, "ey": 0.08}
-# And of their change over the first step.
-_SLOPES = {
-    "scale": 0.01,
-    "aspect": 3e-3,
-    "skew": 3e-3,
-    "xi_r": 5e-3,
-    "xi_t": 2e-3,
-    "ex": 0.02,
-    "ey": 0.02,
-}
-# The scale is held to this while the pictures are adjusted; then the known pixel size multiplies it.
-_HELD = 1e-6
-# Principal point, in image widths, and pivot (1/m), which flat pictures do not show: as in a calibration by a grid.
-_PRINCIPAL_POINT, _PIVOT, _PIVOT_SIGMA = 0.08, 50.0, 60.0
-# Moves that tell the length worse than this tell nothing that --pixel-size by the display width does not.
-_MOST_STAGE_SIGMA = 0.05
-# Cosine of a turn of the scan beyond which its centre counts: one degree.
-_ONE_TURN = 0.99985
-# A place that is pointed at by hand is known to half a pixel; a length of fewer pixels than these says too little.
-_EDGE_SIGMA_PX, _LEAST_LENGTH_PX = 0.5, 20.0
-# How well a magnification comes back where nothing tells it, and the height of what is measured, m: as there.
-_REPEATABILITY, _HEIGHT_M = 1e-3, 1e-5
 
 
 @dataclass(frozen=True)
@@ -140,10 +124,10 @@ class KnownLength:
 
     def __post_init__(self) -> None:
         check_positive(self.length_m, "length", "m")
-        if self.pixels < _LEAST_LENGTH_PX:
+        if self.pixels < LENGTH_MIN_PX:
             raise InvalidValueError(
                 f"a length of {self.pixels:.3g} px",
-                expected=f"{_LEAST_LENGTH_PX:g} px or more",
+                expected=f"{LENGTH_MIN_PX:g} px or more",
                 do="choose two places farther apart",
             )
 
@@ -162,7 +146,7 @@ class KnownLength:
                 f"a length from pixel {self.start_xy} to {self.end_xy}",
                 expected="pixels of the picture",
             )
-        edges = np.sqrt(2.0) * _EDGE_SIGMA_PX / self.pixels
+        edges = np.sqrt(2.0) * POINTED_SIGMA_PX / self.pixels
         return ScaleAnchor(
             self.length_m / seen_m / camera.m, magnification, float(np.hypot(self.sigma, edges))
         )
@@ -240,7 +224,7 @@ class StageMoves:
         )
         ratio = float(weights @ ratios)
         fitted = float(np.sqrt(np.sum((weights * spreads) ** 2))) / ratio
-        if not fitted < _MOST_STAGE_SIGMA or abs(ratios[1] - ratios[0]) > 5.0 * np.hypot(
+        if not fitted < STAGE_SIGMA_MAX or abs(ratios[1] - ratios[0]) > 5.0 * np.hypot(
             np.hypot(*spreads), 2.0 * self.sigma
         ):
             raise CalibrationError(
@@ -267,7 +251,7 @@ def _within_levels(
     count = 0
     for g in np.unique(magnifications):
         own = np.flatnonzero(known & (magnifications == g))
-        own = own[np.cos(angles[own] - angles[own[:1]]) > _ONE_TURN]
+        own = own[np.cos(angles[own] - angles[own[:1]]) > ONE_ROTATION_COS]
         if len(own) > 1:
             level = np.column_stack([position[own], places[own], time[own]])
             rows.append(level - level.mean(axis=0))
@@ -327,10 +311,10 @@ def calibrate_from_specimen(
         If the pictures differ in size, or the anchor is not one of their range.
     """
     seen = sorted({check_positive(p.magnification, "magnification") for p in pictures})
-    if len(seen) < _LEAST_MAGNIFICATIONS:
+    if len(seen) < MAGNIFICATIONS_MIN:
         raise CalibrationError(
             f"pictures at {len(seen)} magnifications",
-            expected=f"{_LEAST_MAGNIFICATIONS} or more, in steps of at most {LARGEST_STEP:g}",
+            expected=f"{MAGNIFICATIONS_MIN} or more, in steps of at most {STEP_MAX:g}",
             do="record more, or take a grid",
         )
     check_steps(seen)
@@ -399,11 +383,11 @@ def _unknown_microscope(
         "aspect": 1.0,
         "px": 0.5 * (width - 1),
         "py": 0.5 * (height - 1),
-        "rho": _PIVOT,
+        "rho": PIVOT,
         "ex": 0.5 * (width - 1),
         "ey": 0.5 * (height - 1),
     }
-    unseen = {"px": _PRINCIPAL_POINT * width, "py": _PRINCIPAL_POINT * width, "rho": _PIVOT_SIGMA}
+    unseen = {"px": PRINCIPAL_POINT * width, "py": PRINCIPAL_POINT * width, "rho": PIVOT_SIGMA}
     functions, sigmas = {}, []
     for name in ("scale", "aspect", "skew", "px", "py", "rho", "xi_r", "xi_t", "ex", "ey"):
         unit = width if name in ("ex", "ey") else 1.0
@@ -411,8 +395,8 @@ def _unknown_microscope(
             own, spread = [means[name]], [unseen[name]]
         else:
             own = [means.get(name, 0.0), 0.0]
-            constant = _HELD if name == "scale" else _CONSTANTS[name]
-            spread = [constant * unit, 0.5 * _SLOPES[name] * unit]
+            constant = SCALE_HELD if name == "scale" else CONSTANT_SIGMAS[name]
+            spread = [constant * unit, 0.5 * SLOPE_SIGMAS[name] * unit]
         functions[name] = ContinuousFunction("chebyshev_log", np.array(own), g_range)
         sigmas += spread
     return CalibrationModel(
@@ -423,7 +407,7 @@ def _unknown_microscope(
         display_width_m=display_width_m,
         magnifications=g_range,
         method=METHOD,
-        scale_sigma=ScaleSigma(repeatability=_REPEATABILITY, height_m=_HEIGHT_M),
+        scale_sigma=ScaleSigma(repeatability=REPEATABILITY, height_m=HEIGHT_SIGMA_M),
     )
 
 

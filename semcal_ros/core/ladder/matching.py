@@ -34,11 +34,18 @@ from semcal_ros.core.ladder.correspondences import (
     match_pictures,
 )
 from semcal_ros.core.ladder.residuals import camera_of
+from semcal_ros.core.ladder.thresholds import (
+    CORRELATION_SURE,
+    QUARTER_TURNS_RAD,
+    ROUNDING_RATIO,
+    SAME_ANGLE_RAD,
+    SETTING_RATIO,
+    STEP_MAX,
+    TURNED_RAD,
+)
 from semcal_ros.core.ladder.unknowns import LadderSetup, start_state
 
 __all__ = [
-    "LARGEST_STEP",
-    "ONE_SETTING",
     "LadderPicture",
     "Match",
     "RejectedPair",
@@ -51,19 +58,6 @@ __all__ = [
     "match_all",
     "picture_xy",
 ]
-
-#: Largest ratio of neighbouring magnifications of a ladder: at 1.6 the upper picture covers 39 % of the lower one.
-LARGEST_STEP = 1.6
-#: Between magnifications that are so close no microscope switches its range: they are one setting, stated twice.
-ONE_SETTING = 1.06
-# What rounding of a magnification adds.
-_ROUNDING = 1.02
-# Scans of unknown rotation are tried at these.
-_QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
-# Median correlation of blocks of which no other quarter has more.
-_SURE = 0.5
-# Turns that differ by less are tried once; those that a map may be off by, rad.
-_SAME_RAD, _TURNED_RAD = 0.1, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +116,7 @@ def picture_xy(xy: Array, scale: float) -> Array:
 
 def _is_gap(below: float, above: float) -> bool:
     """Whether a step between two magnifications is too large to match their pictures."""
-    return above > LARGEST_STEP * _ROUNDING * below
+    return above > STEP_MAX * ROUNDING_RATIO * below
 
 
 def check_steps(magnifications: Iterable[float], known: tuple[float, float] | None = None) -> None:
@@ -145,7 +139,7 @@ def check_steps(magnifications: Iterable[float], known: tuple[float, float] | No
         if _is_gap(below, above) and not inside:
             raise CalibrationError(
                 f"a gap in the ladder from {below:g}x to {above:g}x, a factor of {above / below:.2f}",
-                expected=f"steps of at most {LARGEST_STEP:g}",
+                expected=f"steps of at most {STEP_MAX:g}",
                 do=f"record pictures at {np.sqrt(below * above):.0f}x, too",
             )
 
@@ -159,7 +153,7 @@ def _candidates(pictures: Sequence[LadderPicture]) -> list[tuple[int, int]]:
     settings: list[list[int]] = []
     for number in ascending:
         g = pictures[number].magnification
-        if settings and g < ONE_SETTING * pictures[settings[-1][0]].magnification:
+        if settings and g < SETTING_RATIO * pictures[settings[-1][0]].magnification:
             settings[-1].append(number)
         else:
             settings.append([number])
@@ -203,7 +197,7 @@ def match_all(
                 continue
             if best is None or found.correlation * np.sqrt(len(found)) > best[0]:
                 best = (found.correlation * float(np.sqrt(len(found))), found)
-            if found.correlation > _SURE:
+            if found.correlation > CORRELATION_SURE:
                 break
         if best is not None:
             matches[pair] = Match(first, second, best[1])
@@ -236,16 +230,17 @@ def _stated_turn(first: LadderPicture, second: LadderPicture) -> float | None:
 
 def _turns_to_try(first: LadderPicture, second: LadderPicture) -> tuple[float, ...]:
     stated = _stated_turn(first, second)
-    return _QUARTERS if stated is None else (stated,)
+    return QUARTER_TURNS_RAD if stated is None else (stated,)
 
 
 def _other_turns(stated: float) -> tuple[float, ...]:
     """Turns beside the stated one: the other sense first."""
-    others = (-stated, *(stated + quarter for quarter in _QUARTERS[1:]))
+    others = (-stated, *(stated + quarter for quarter in QUARTER_TURNS_RAD[1:]))
     kept: list[float] = []
     for turn in others:
         if all(
-            abs(math.remainder(turn - one, 2.0 * math.pi)) > _SAME_RAD for one in (stated, *kept)
+            abs(math.remainder(turn - one, 2.0 * math.pi)) > SAME_ANGLE_RAD
+            for one in (stated, *kept)
         ):
             kept.append(turn)
     return tuple(kept)
@@ -278,7 +273,7 @@ def compare_turns(pictures: Sequence[LadderPicture], matches: Sequence[Match]) -
         seen = math.atan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
 
         def is_close(angle: float, seen: float = seen) -> bool:
-            return abs(math.remainder(seen - angle, 2.0 * math.pi)) < _TURNED_RAD
+            return abs(math.remainder(seen - angle, 2.0 * math.pi)) < TURNED_RAD
 
         if is_close(stated):
             # Half a turn, and none, look the same in both senses.

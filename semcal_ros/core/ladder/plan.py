@@ -24,17 +24,9 @@ import numpy as np
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.ladder.thresholds import ANCHORS, LADDER_MOVES, MAGNIFICATION_MAX, STEP
 
-__all__ = ["LADDER_MOVES", "PlannedStep", "plan_ladder"]
-
-#: Moves of the specimen at each magnification, in fields of view; the picture with the turned scan is in the middle.
-LADDER_MOVES = ((0.0, 0.0), (0.25, 0.08), (-0.07, 0.26))
-# Ratio of neighbouring magnifications: the upper picture covers 44 % of the lower one.
-_STEP = 1.5
-# Steps that lie inside the calibrated range, so that the scale does not rest on one visit.
-_ANCHORS = 3
-# Beyond this no scanning electron microscope magnifies.
-_MOST = 1e7
+__all__ = ["PlannedStep", "plan_ladder"]
 
 
 @dataclass(frozen=True)
@@ -76,18 +68,18 @@ def plan_ladder(model: CalibrationModel, magnification: float) -> tuple[PlannedS
     """
     last = check_positive(magnification, "magnification")
     low, high = model.magnification_range
-    if low <= last <= high or last > _MOST or last < low * low / _MOST:
+    if low <= last <= high or last > MAGNIFICATION_MAX or last < low * low / MAGNIFICATION_MAX:
         raise InvalidValueError(
             f"an extension to {last:g}x of a calibration of {low:g}x to {high:g}x",
-            expected=f"a magnification beyond that, up to {_MOST:g}x",
+            expected=f"a magnification beyond that, up to {MAGNIFICATION_MAX:g}x",
         )
     upwards = last > high
     edge = high if upwards else low
     sign = 1.0 if upwards else -1.0
     # A range that is shorter has fewer steps inside.
-    inside = min(_ANCHORS - 1, math.floor(math.log(high / low) / math.log(_STEP) + 1e-9))
-    first = edge * _STEP ** (-sign * inside)
-    count = math.ceil(abs(math.log(last / first)) / math.log(_STEP) - 1e-9)
+    inside = min(ANCHORS - 1, math.floor(math.log(high / low) / math.log(STEP) + 1e-9))
+    first = edge * STEP ** (-sign * inside)
+    count = math.ceil(abs(math.log(last / first)) / math.log(STEP) - 1e-9)
     steps = []
     for number, g in enumerate(np.geomspace(first, last, count + 1)):
         digits = 10.0 ** (math.floor(math.log10(g)) - 3)

@@ -38,7 +38,8 @@ from semcal_ros.core.camera.projection import (
 from semcal_ros.core.camera.residual_field import FieldSlice
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_distortion import Raster
-from semcal_ros.core.ladder.unknowns import POSE_SIZE, LadderSetup, LadderState
+from semcal_ros.core.ladder.thresholds import POSE_SIZE, SLOPE_STEPS, TIME_STEPS
+from semcal_ros.core.ladder.unknowns import LadderSetup, LadderState
 
 __all__ = [
     "Link",
@@ -49,11 +50,6 @@ __all__ = [
     "pair_values",
     "place_on_specimen",
 ]
-
-# A drift by a tenth of the picture in a frame, which is the most, leaves a ten-thousandth of the way.
-_TIME_STEPS = 5
-# Newton's method converges quadratically, from a start that is exact without a slope.
-_STEPS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +209,7 @@ def place_on_specimen(state: LadderState, picture: int, xy: Array, time: Array) 
     places = (flat - pixel * (pose[1:3] + time[:, None] * pose[3:5])) @ turn
     places = places - pixel * time[:, None] * state.drifts[picture]
     if np.any(state.slope):
-        for _ in range(_STEPS):
+        for _ in range(SLOPE_STEPS):
             seen = _see(state, picture, places, time)
             places = places + np.linalg.solve(seen.by_place, (xy - seen.xy)[..., None])[..., 0]
     return np.asarray(places)
@@ -230,7 +226,7 @@ def _predict(state: LadderState, link: Link, places: Array) -> tuple[Array, Arra
     """Pixels (n, 2) of the second picture where places are seen, and their times (n,)."""
     parameters, raster = state.parameters[link.second], Raster.of(*state.setup.image_size)
     time = link.second_time
-    for _ in range(_TIME_STEPS):
+    for _ in range(TIME_STEPS):
         xyz = _in_sem_frame(state, link.second, places, time)
         seen = project_points(parameters, xyz, raster)
         before, time = time, link.second_time + (seen - link.second_xy) @ link.time_slope

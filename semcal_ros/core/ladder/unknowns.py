@@ -42,6 +42,7 @@ from itertools import pairwise
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices, equilibrate
+from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
     CalibrationModel,
@@ -51,9 +52,17 @@ from semcal_ros.core.camera.calibration_model import (
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES, camera_size
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.ladder.thresholds import (
+    BEND_FACTOR,
+    BENDS_MIN,
+    JUMP_SIGMA,
+    POSE_SIZE,
+    SINGULAR_PART,
+    SLOPE_SIGMA_RAD,
+    VISIT_SIGMA_MIN,
+)
 
 __all__ = [
-    "POSE_SIZE",
     "LadderSetup",
     "LadderState",
     "PicturePlace",
@@ -63,26 +72,8 @@ __all__ = [
     "start_state",
 ]
 
-#: Turn (rad), shift (x, y) and change of the drift (x, y), both in nominal pixels of the picture.
-POSE_SIZE = 5
 # Pictures of a flat specimen from above tell nothing of these.
 _UNSEEN = ("px", "py", "rho")
-# Least 1-sigma of the second derivatives by log g: relative, in normalised coordinates, or, for centres, in image
-# widths. Over a step of 1.5 each of them bends the edge of 1024 px by 0.15 px, and the functions of the virtual
-# JSM-820 bend by less.
-_LEAST_BEND = {"scale": 4e-3, "aspect": 4e-3, "skew": 4e-3, "ex": 0.02, "ey": 0.02}
-_LEAST_BEND_OTHERS = 4e-3
-# The functions may bend by twice as much as they do where they are known.
-_BEND_FACTOR = 2.0
-# 1-sigma of a jump of the scale that was found, and of one that is not there.
-JUMP_SIGMA, _NO_JUMP = 0.03, 1e-9
-# Of the largest eigenvalue of a matrix of correlations: what is below is rounding.
-_SINGULAR = 1e-13
-# Prior 1-sigma of the slope of the specimen: six degrees, so that pictures at low magnification, where it shows, decide
-# whether it lies flat; at high magnification it does not show, and does no harm.
-_SLOPE_SIGMA_RAD = 0.1
-# Least repeatability of the scale of a magnification that is set again: that of the last digit of a scan generator.
-_LEAST_VISIT = 2e-5
 
 
 @dataclass(frozen=True)
@@ -396,7 +387,7 @@ def make_setup(
         bend_columns=np.array(bends, dtype=np.intp),
         jump_columns=np.array(jumps, dtype=np.intp),
         intervals=intervals,
-        visit_sigma=max(model.scale_sigma.repeatability, _LEAST_VISIT),
+        visit_sigma=max(model.scale_sigma.repeatability, VISIT_SIGMA_MIN),
     )
 
 
@@ -405,14 +396,14 @@ def prior_root(covariance: Array) -> Array:
     # Pixels beside normalised coordinates: without the scaling, rounding would take the small ones.
     scaled, scale = equilibrate(covariance)
     variances, directions = np.linalg.eigh(scaled)
-    kept = variances > _SINGULAR * variances.max()
+    kept = variances > SINGULAR_PART * variances.max()
     return np.asarray(directions[:, kept] * np.sqrt(variances[kept]) / scale[:, None])
 
 
 def _bend_sigma(model: CalibrationModel, name: str) -> float:
     """Prior 1-sigma of the second derivative of a function by log g: what it is where it is known, and a least."""
     low, high = model.magnification_range
-    least = _LEAST_BEND.get(name, _LEAST_BEND_OTHERS)
+    least = BENDS_MIN.get(name, BENDS_MIN["others"])
     if name in ("ex", "ey"):
         least *= model.image_width
     if high < 1.5 * low:
@@ -426,7 +417,7 @@ def _bend_sigma(model: CalibrationModel, name: str) -> float:
         for place, jump in zip(own.breaks, jumps, strict=True):
             values -= jump * (np.exp(grid) >= place)
     bends = np.diff(values, 2) / (grid[1] - grid[0]) ** 2
-    return max(least, _BEND_FACTOR * float(np.sqrt(np.mean(bends**2))))
+    return max(least, BEND_FACTOR * float(np.sqrt(np.mean(bends**2))))
 
 
 def start_state(setup: LadderSetup) -> LadderState:
@@ -451,11 +442,11 @@ def start_state(setup: LadderSetup) -> LadderState:
 
 def slope_sigma() -> float:
     """Prior 1-sigma of the slope of the specimen along each axis, rad."""
-    return _SLOPE_SIGMA_RAD
+    return SLOPE_SIGMA_RAD
 
 
 def jump_sigmas(setup: LadderSetup, active: tuple[int, ...]) -> Array:
     """(J,) prior 1-sigma of the jumps: those that were found, and the others."""
-    sigmas = np.full(len(setup.jump_columns), _NO_JUMP)
+    sigmas = np.full(len(setup.jump_columns), HELD_SIGMA)
     sigmas[list(active)] = JUMP_SIGMA
     return sigmas

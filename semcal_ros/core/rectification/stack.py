@@ -34,10 +34,7 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
-from semcal_ros.core.rectification.thresholds import EDGE_PX
-
-# Rows or columns that an interpolation takes beyond the two nearest ones.
-_REACH_PX = {"linear": 0, "cubic": 1, "lanczos4": 3}
+from semcal_ros.core.rectification.thresholds import EDGE_PX, REACH_PX
 
 
 @dataclass(frozen=True)
@@ -104,7 +101,7 @@ class Stack:
         if width < 1 or height < 1:
             raise InvalidValueError(f"a stack of {width} x {height} px", expected="a positive size")
         self._rectifier = Rectifier(interpolation)
-        self._reach = _REACH_PX[interpolation]
+        self._reach = REACH_PX[interpolation]
         self._size = (width, height)
         # Sums of single-precision grey levels in double precision: the rounding of their
         # squares is far below the resolution of the grey levels.

@@ -272,3 +272,10 @@ EDGE_PX = TABLE.derived(
     "EDGE_PX", 1e-3, "px",
     "MAP_ERROR_MAX_PX: a pixel at the edge must not drop out by rounding.",
 )
+
+# Interpolations, in stack.py
+
+REACH_PX = TABLE.defined(
+    "REACH_PX", {"linear": 0, "cubic": 1, "lanczos4": 3}, "px",
+    "Rows or columns that an interpolation takes beyond the two nearest ones.",
+)

@@ -27,7 +27,6 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError, Rejection
 from semcal_ros.core.ladder.acquisition import (
-    MOST_OFF,
     PictureRequest,
     TakenPicture,
     find_offset,
@@ -36,6 +35,7 @@ from semcal_ros.core.ladder.acquisition import (
     take_picture,
 )
 from semcal_ros.core.ladder.matching import LadderPicture
+from semcal_ros.core.ladder.thresholds import OFF_CENTRE_MAX
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 from semcal_ros.nodes.acquisition.run import AWAY, Run, Taker
 from semcal_ros.nodes.common.parameters import Parameters
@@ -45,7 +45,7 @@ _MOST_MOVES = 4
 # The picture that is being scanned on arrival, and the first that is scanned after it.
 _PICTURES = 2
 # Off the middle, as a part of the field, from which it is brought back: well within what a picture may be off.
-_NEAR = 0.5 * MOST_OFF
+_NEAR = 0.5 * OFF_CENTRE_MAX
 # A stage that is tilted by more is not the untilted one that a ladder needs: it looks 0.1 % shorter.
 _TILTED_RAD = math.radians(2.5)
 

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.calibration.acquisition import (
-    MOST_VIEWS,
     AcquisitionGoal,
     ViewRequest,
     find_picture_fault,
@@ -36,6 +35,7 @@ from semcal_ros.core.calibration.acquisition import (
     request_of_picture,
 )
 from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, MicroscopeError
 from semcal_ros.core.ladder.acquisition import PictureRequest
@@ -77,7 +77,7 @@ ACQUISITION = (
         choices=("scan_rotation", "rotation", "nothing"),
     ),
     ParameterDeclaration(
-        "most_views", MOST_VIEWS, "Views that ~/acquire takes at most.", "", 6, 1000
+        "most_views", VIEWS_MAX, "Views that ~/acquire takes at most.", "", 6, 1000
     ),
     ParameterDeclaration(
         "record",

@@ -42,6 +42,7 @@ from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.presets import preset
 from semcal_ros.synthetic.specimens.ball_body import TEXTURES, BallOnTip
 from semcal_ros.synthetic.specimens.ray_lattice import RayLattice, trace_ray_lattice
+from semcal_ros.synthetic.specimens.thresholds import BALL_MARGIN_M, BALL_SAMPLES
 from semcal_ros.synthetic.truth import parameters_of
 
 __all__ = [
@@ -60,10 +61,6 @@ BALL_MAGNIFICATIONS = tuple(9000.0 + 100.0 * step for step in range(11))
 
 
 BALL_TRUTH_SCHEMA = "semcal_ros/ball_truth/1"
-
-# Samples per pixel and direction: the outline has steps of a quarter of the contrast at most.
-_SAMPLES = 2
-_MARGIN_M = 20e-9  # by which perspective moves the outline at the end of the tip, and more
 
 
 @dataclass(frozen=True)
@@ -161,7 +158,7 @@ class BallPlan:
         """(height + databar_rows, width) image of a frame, every line at its own time."""
         frame = self.frames[index]
         pad = self.detector.pad_px
-        rays = trace_ray_lattice(self.microscope, float(frame.magnification), _SAMPLES, pad)
+        rays = trace_ray_lattice(self.microscope, float(frame.magnification), BALL_SAMPLES, pad)
         seen = self._reflectivity(rays, frame.start_time_s)
         return self.detector.expose(seen, np.random.default_rng((self.seed, index)))
 
@@ -173,8 +170,8 @@ class BallPlan:
         if box is None:
             return total
         (top, bottom), (left, right) = box
-        lines = slice(top * _SAMPLES, bottom * _SAMPLES)
-        basis = rays.basis[:, left * _SAMPLES : right * _SAMPLES]
+        lines = slice(top * BALL_SAMPLES, bottom * BALL_SAMPLES)
+        basis = rays.basis[:, left * BALL_SAMPLES : right * BALL_SAMPLES]
         x, y = rays.x_m[lines] @ basis, rays.y_m[lines] @ basis
         left_s, right_s = _compute_line_times(rays, self.microscope.timing)
         rotation, place = self.pose_at(start_time_s + 0.5 * (left_s + right_s)[lines])
@@ -188,7 +185,7 @@ class BallPlan:
             yields[bare] = self.specimen.substrate(
                 x[bare] - drift[line, 0], y[bare] - drift[line, 1]
             )
-        fine = yields.reshape(bottom - top, _SAMPLES, right - left, _SAMPLES)
+        fine = yields.reshape(bottom - top, BALL_SAMPLES, right - left, BALL_SAMPLES)
         total[top:bottom, left:right] = fine.mean(axis=(1, 3))
         if self.specimen.charging:
             total = _darken_lines(total, self.specimen, float(np.mean(camera.pixel_size_m)))
@@ -201,10 +198,10 @@ class BallPlan:
         if self.specimen.substrate_contrast == 0.0:
             return np.full(shape, self.specimen.background, dtype=np.float32)
         left_s, right_s = _compute_line_times(rays, self.microscope.timing)
-        drift = np.asarray(self.drift(start_time_s + 0.5 * (left_s + right_s)))[::_SAMPLES]
-        basis = rays.basis[:, ::_SAMPLES]
-        x = rays.x_m[::_SAMPLES] @ basis - drift[:, :1]
-        y = rays.y_m[::_SAMPLES] @ basis - drift[:, 1:]
+        drift = np.asarray(self.drift(start_time_s + 0.5 * (left_s + right_s)))[::BALL_SAMPLES]
+        basis = rays.basis[:, ::BALL_SAMPLES]
+        x = rays.x_m[::BALL_SAMPLES] @ basis - drift[:, :1]
+        y = rays.y_m[::BALL_SAMPLES] @ basis - drift[:, 1:]
         return np.asarray(self.specimen.substrate(x, y), dtype=np.float32)
 
     def _box(
@@ -335,8 +332,8 @@ def _find_near(
     along = (dx * axis[:, :1] + dy * axis[:, 1:]) / length
     across = np.abs(dx * axis[:, 1:] - dy * axis[:, :1]) / length
     radius = body.tip_radius_m + body.tip_slope * np.maximum(along, 0.0) / length
-    tip = (across < radius + _MARGIN_M) & (along > -radius)
-    ball = dx * dx + dy * dy < (body.reach_m + _MARGIN_M) ** 2
+    tip = (across < radius + BALL_MARGIN_M) & (along > -radius)
+    ball = dx * dx + dy * dy < (body.reach_m + BALL_MARGIN_M) ** 2
     return np.asarray(ball | (tip & (along < body.tip_length_m * length + radius)))
 
 

@@ -31,19 +31,11 @@ from scipy.spatial import cKDTree
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
+from semcal_ros.synthetic.specimens.thresholds import BODY_ROOM, BODY_STEPS, BODY_TILE, GRAIN_VOXELS
 
 #: Statistics of the texture: noise of two grain sizes; Voronoi cells, each of one brightness; bright cells
 #: with dark seams; a narrow band of wavelengths; bright spots on a dark ground.
 TEXTURES = ("noise", "islands", "cracks", "speckle", "spots")
-
-# Voxels along each side of the periodic noise: the two grain sizes take 17 MB in single precision.
-_TILE = 128
-# Voxels per grain, where the tile does not have to be coarser to hold the whole ball.
-_VOXELS = 10.0
-# By how much the tile is wider than the ball: the texture does not repeat on it.
-_ROOM = 1.1
-# Newton steps to a surface that departs from a sphere by some per cent: the error falls below 1e-6 of it.
-_STEPS = 12
 
 
 @dataclass(frozen=True)
@@ -168,7 +160,7 @@ class BallOnTip:
         """Go from the enclosing sphere along rays to the surface; inf for those that miss it."""
         hit = np.flatnonzero(np.isfinite(along))
         o, d, t = origin[hit], direction[hit], along[hit].copy()
-        for _ in range(_STEPS):
+        for _ in range(BODY_STEPS):
             at = o + t[:, None] * d
             fall = -np.sum(self._slope(at, unit=False) * d, axis=1)
             # A ray that grazes the surface takes steps that are too long: a part of the height at most.
@@ -233,7 +225,7 @@ class BallOnTip:
         """(n,) relative reflectivity at body-frame points (n, 3): a solid texture, mean 1."""
         voxel = self.grain_m
         if self.texture_name != "noise":
-            voxel = max(self.grain_m / _VOXELS, _ROOM * self.diameter_m / _TILE)
+            voxel = max(self.grain_m / GRAIN_VOXELS, BODY_ROOM * self.diameter_m / BODY_TILE)
         tile = _make_texture(self.texture_name, self.grain_m / voxel, self.seed)
         grains = map_coordinates(tile, (points_m / voxel).T, order=1, mode="grid-wrap")
         return np.asarray(np.clip(1.0 + self.contrast * grains, 0.2, 2.0), dtype=np.float64)
@@ -242,8 +234,8 @@ class BallOnTip:
         """Reflectivity of what lies far below at sem-frame X, Y."""
         if self.substrate_contrast == 0.0:
             return np.full(x_m.shape, self.background)
-        voxel = self.substrate_grain_m / _VOXELS
-        layer = _make_texture("speckle", _VOXELS, self.seed + 1)[0]
+        voxel = self.substrate_grain_m / GRAIN_VOXELS
+        layer = _make_texture("speckle", GRAIN_VOXELS, self.seed + 1)[0]
         grains = map_coordinates(layer, [x_m / voxel, y_m / voxel], order=1, mode="grid-wrap")
         lit = 1.0 + self.substrate_contrast * np.clip(grains, -2.0, 2.0)
         return np.asarray(self.background * np.maximum(lit, 0.0), dtype=np.float64)
@@ -256,14 +248,14 @@ def _make_texture(name: str, grain: float, seed: int) -> Image:
     if name == "noise":
         made = _make_noise(rng)
     elif name == "speckle":
-        white = rng.standard_normal((_TILE, _TILE, _TILE), dtype=np.float32)
+        white = rng.standard_normal((BODY_TILE, BODY_TILE, BODY_TILE), dtype=np.float32)
         # In three dimensions k^2 (k^2 s^2 exp(-k^2 s^2 / 2))^2 is largest at k s = 1.7, 3.6 s long.
         fine = grain / 3.6
         made = gaussian_filter(white, fine, mode="wrap")
         made -= gaussian_filter(white, 1.6 * fine, mode="wrap")
     elif name == "spots":
-        made = np.zeros((_TILE, _TILE, _TILE), dtype=np.float32)
-        seeds = tuple(rng.integers(0, _TILE, (3, _count_grains(grain))))
+        made = np.zeros((BODY_TILE, BODY_TILE, BODY_TILE), dtype=np.float32)
+        seeds = tuple(rng.integers(0, BODY_TILE, (3, _count_grains(grain))))
         np.add.at(made, seeds, rng.uniform(0.5, 1.5, len(seeds[0])).astype(np.float32))
         made = gaussian_filter(made, 0.25 * grain, mode="wrap")
     else:
@@ -273,26 +265,26 @@ def _make_texture(name: str, grain: float, seed: int) -> Image:
 
 
 def _count_grains(grain: float) -> int:
-    return max(8, round((_TILE / grain) ** 3))
+    return max(8, round((BODY_TILE / grain) ** 3))
 
 
 def _make_cells(name: str, grain: float, rng: np.random.Generator) -> Image:
     """Make Voronoi cells of random brightness; with dark seams for cracks."""
-    seeds = rng.uniform(0.0, _TILE, (_count_grains(grain), 3))
-    tree = cKDTree(seeds, boxsize=_TILE)
-    axis = np.arange(_TILE, dtype=np.float64)
+    seeds = rng.uniform(0.0, BODY_TILE, (_count_grains(grain), 3))
+    tree = cKDTree(seeds, boxsize=BODY_TILE)
+    axis = np.arange(BODY_TILE, dtype=np.float64)
     at = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     distance, index = tree.query(at, k=2)
     bright = rng.uniform(-1.0, 1.0, len(seeds))[index[:, 0]]
     if name == "cracks":
         seam = np.exp(-0.5 * ((distance[:, 1] - distance[:, 0]) / (0.2 * grain)) ** 2)
         bright = 0.4 * bright - 2.0 * seam
-    return np.asarray(bright.reshape(_TILE, _TILE, _TILE), dtype=np.float32)
+    return np.asarray(bright.reshape(BODY_TILE, BODY_TILE, BODY_TILE), dtype=np.float32)
 
 
 def _make_noise(rng: np.random.Generator) -> Image:
     """Make noise with grains of two sizes."""
-    white = rng.standard_normal((2, _TILE, _TILE, _TILE), dtype=np.float32)
+    white = rng.standard_normal((2, BODY_TILE, BODY_TILE, BODY_TILE), dtype=np.float32)
     fine, coarse = (
         gaussian_filter(w, s, mode="wrap") for w, s in zip(white, (1.2, 2.6), strict=True)
     )

@@ -39,28 +39,11 @@ from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.substrate import Substrate
-
-CANTILEVER_MAGNIFICATIONS: tuple[float, ...] = (6450.0, 7760.0, 8890.0)
-"""Those of Malti et al. (2012), section 4.3."""
-
-# No push on the way back repeats one of the way up.
-CANTILEVER_PUSHES: tuple[float, ...] = (
-    0.0,
-    0.08,
-    0.24,
-    0.44,
-    0.64,
-    0.84,
-    1.0,
-    0.72,
-    0.4,
-    0.12,
-    0.0,
+from semcal_ros.synthetic.specimens.thresholds import (
+    CANTILEVER_MAGNIFICATIONS,
+    CANTILEVER_PUSHES,
+    FREE_GAP_M,
 )
-"""Fractions of the largest deflection in 11 poses: free, pushed up to the seventh, back to free."""
-
-# Far enough that the pusher never shades what it does not touch.
-_FREE_GAP_M = 600e-9
 
 
 @dataclass(frozen=True)
@@ -455,7 +438,7 @@ def cantilever_plan(
     step_s = max(interval_s, microscope.timing.acquisition_time_s)
     planned: list[CantileverFrame] = []
     for number, push in enumerate(pushes):
-        gap = 0.0 if push > 0.0 else _FREE_GAP_M
+        gap = 0.0 if push > 0.0 else FREE_GAP_M
         deflection_m = push * base.push_direction * largest_deflection_m
         pushed = replace(base, deflection_m=deflection_m, gap_m=gap)
         for g in magnifications:

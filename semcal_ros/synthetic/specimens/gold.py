@@ -24,18 +24,13 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
-
-# Texels along each side of a tile: 17 diameters of its largest particle.
-_TILE = 1024
-# Smallest and largest radius. Their ratio of 5 exceeds the ratio of 4 between octaves, so that the
-# sizes have no gap.
-_RADII_TEXELS = (6.0, 30.0)
-_MARGIN = 32  # texels around a particle's centre, beyond the largest radius and its soft edge
-# Summed area of the particles, relative to the tile: six octaves leave exp(-6 * 0.17) = 36 % of the
-# film bare.
-_COVERAGE = 0.17
-# Rotation from octave to octave: no small number of them is a whole turn, so octaves do not align.
-_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+from semcal_ros.synthetic.specimens.thresholds import (
+    GOLD_COVERAGE,
+    GOLD_MARGIN,
+    GOLD_RADII_TEXELS,
+    GOLD_TILE,
+    OCTAVE_ROTATION_RAD,
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +72,7 @@ class GoldOnCarbon:
         pixel_m = math.sqrt(abs(float(np.linalg.det(footprint_m))))
         seen = np.full(x_m.shape, self.carbon, dtype=np.float32)
         for octave in range(self.octaves):
-            texel_m = self.largest_m / (2.0 * _RADII_TEXELS[1]) / self.ratio**octave
+            texel_m = self.largest_m / (2.0 * GOLD_RADII_TEXELS[1]) / self.ratio**octave
             cover, light = self._octave(octave, texel_m, pixel_m, x_m, y_m)
             seen *= 1.0 - cover
             seen += light
@@ -94,7 +89,7 @@ class GoldOnCarbon:
             y_m,
             texel_m=texel_m,
             pixel_m=pixel_m,
-            angle_rad=_GOLDEN_ANGLE * (octave + 1),
+            angle_rad=OCTAVE_ROTATION_RAD * (octave + 1),
             shift=np.random.default_rng([self.seed, octave]).uniform(0.0, 1.0, 2),
         )
         return (mean[0], mean[1]) if seen is None else (seen[..., 0], seen[..., 1])
@@ -109,17 +104,17 @@ def _make_pyramid(seed: int) -> tuple[tuple[Image, ...], Image]:
 
 def _draw_tile(rng: np.random.Generator) -> Image:
     """Draw one periodic tile (n, n, 2): cover in 0..1, and light = cover times brightness."""
-    span = np.arange(-_MARGIN, _MARGIN + 1)
-    tile = np.zeros((_TILE, _TILE, 2), dtype=np.float32)
+    span = np.arange(-GOLD_MARGIN, GOLD_MARGIN + 1)
+    tile = np.zeros((GOLD_TILE, GOLD_TILE, 2), dtype=np.float32)
     covered = 0.0
-    while covered < _COVERAGE * _TILE * _TILE:
+    while covered < GOLD_COVERAGE * GOLD_TILE * GOLD_TILE:
         # Small particles are more frequent: log-uniform radii.
-        radius = float(np.exp(rng.uniform(*np.log(_RADII_TEXELS))))
-        centre = rng.uniform(0.0, _TILE, 2)
+        radius = float(np.exp(rng.uniform(*np.log(GOLD_RADII_TEXELS))))
+        centre = rng.uniform(0.0, GOLD_TILE, 2)
         brightness = rng.uniform(0.25, 0.95)
         covered += math.pi * radius * radius
         first = np.floor(centre).astype(np.intp)
-        window = np.ix_((first[0] + span) % _TILE, (first[1] + span) % _TILE)
+        window = np.ix_((first[0] + span) % GOLD_TILE, (first[1] + span) % GOLD_TILE)
         offset = (first - centre)[:, None] + span
         distance = np.hypot(offset[0][:, None], offset[1][None, :])
         cover, light = _draw_particle(distance, radius, brightness)

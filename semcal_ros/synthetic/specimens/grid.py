@@ -25,22 +25,14 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
-
-SQUARES_M: tuple[float, ...] = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
-"""Square sizes of the multi-scale grid."""
-
-_LARGEST_SQUARE = 0.155  # of the image width: at least six squares are in view
-
-# No grid is off by more than this part: it would be another grid.
-_LARGEST_FAULT = 0.05
-# 1/m. At 100x the field reaches 0.85 mm from its middle: on a tighter curve its border would be steeper than
-# 10 degrees, and no chip is.
-_LARGEST_CURVATURE = 200.0
-# The height changes by the slope of the surface (0.17 at most) times the tangent of the tilt (1.7 at 60
-# degrees) in every step, and falls below the tolerance in 15 steps.
-_SURFACE_STEPS = 60
-# Of a square, which is at least 11 px wide: 1e-7 px.
-_SURFACE_TOLERANCE = 1e-8
+from semcal_ros.synthetic.specimens.thresholds import (
+    CURVATURE_MAX,
+    FAULT_MAX,
+    SQUARE_MAX,
+    SQUARES_M,
+    SURFACE_STEPS,
+    SURFACE_TOLERANCE,
+)
 
 
 class Specimen(Protocol):
@@ -112,15 +104,15 @@ class GridFaults:
         parts = ("stretch", "shear", "wave", "squares_sigma")
         for name in parts:
             value = getattr(self, name)
-            if not abs(value) <= _LARGEST_FAULT:
+            if not abs(value) <= FAULT_MAX:
                 raise InvalidValueError(
-                    f"a grid with {name} {value:g}", expected=f"at most {_LARGEST_FAULT:g}"
+                    f"a grid with {name} {value:g}", expected=f"at most {FAULT_MAX:g}"
                 )
-        if not abs(self.curvature) <= _LARGEST_CURVATURE:
+        if not abs(self.curvature) <= CURVATURE_MAX:
             radius_m = 1.0 / self.curvature
             raise InvalidValueError(
                 f"a grid bowed to a radius of {1e3 * radius_m:g} mm",
-                expected=f"at least {1e3 / _LARGEST_CURVATURE:g} mm",
+                expected=f"at least {1e3 / CURVATURE_MAX:g} mm",
             )
         if self.squares_sigma < 0.0 or not (
             math.isfinite(self.wave_squares) and self.wave_squares >= 2.0
@@ -220,12 +212,12 @@ class ChessGrid:
         if self.faults.is_flat_and_regular:
             return (u_m, v_m) if self.size_error == 0.0 else (u_m / size, v_m / size)
         height = np.zeros_like(u_m)
-        for _ in range(_SURFACE_STEPS):
+        for _ in range(SURFACE_STEPS):
             a, b = u_m + lift[0] * height, v_m + lift[1] * height
             x, y = self.faults.removed(a / size, b / size, self.square_m)
             before, height = height, 0.5 * size * self.faults.curvature * (x * x + y * y)
             change = np.abs(lift * (height - before)).max()
-            if change <= _SURFACE_TOLERANCE * self.square_m:
+            if change <= SURFACE_TOLERANCE * self.square_m:
                 return x, y
         raise InvalidValueError(
             f"a grid bowed to a radius of {1e3 / self.faults.curvature:g} mm, which rays only graze",
@@ -269,6 +261,6 @@ def _integrate_wave(u: Array) -> Array:
 
 def square_for(pixel_size_m: float, image_width: int = 512) -> float:
     """Return the square size in m that an operator would choose: the largest with six squares in view."""
-    limit = _LARGEST_SQUARE * image_width * pixel_size_m
+    limit = SQUARE_MAX * image_width * pixel_size_m
     fitting = [square for square in SQUARES_M if square <= limit]
     return max(fitting, default=min(SQUARES_M))

@@ -36,12 +36,7 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
-
-# The errors in the header are those of this spacing and of quintic splines.
-_NODE_SPACING_PX = 12.0
-# Above 96 * 12 px the spacing grows with the frame, which bounds the cost of a wide one.
-_MOST_INTERVALS = 96
-_DEGREE = 5  # quintic
+from semcal_ros.synthetic.specimens.thresholds import INTERVALS_MAX, NODE_DEGREE, NODE_SPACING_PX
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,13 +220,13 @@ def trace_ray_lattice(
 def _place_nodes(pixels: int, pad: int) -> Array:
     """Place nodes over an image side, pad included."""
     first, last = -0.5 - pad, pixels - 0.5 + pad
-    spacing = max(_NODE_SPACING_PX, pixels / _MOST_INTERVALS)
-    return np.linspace(first, last, max(2 * _DEGREE, round((last - first) / spacing) + 1))
+    spacing = max(NODE_SPACING_PX, pixels / INTERVALS_MAX)
+    return np.linspace(first, last, max(2 * NODE_DEGREE, round((last - first) / spacing) + 1))
 
 
 def _make_spline_basis(nodes: Array, samples: Array) -> Array:
     """Return the (nodes, samples) matrix from values at the nodes to a spline's values at the samples."""
-    spline = make_interp_spline(nodes, np.eye(len(nodes)), k=_DEGREE)
+    spline = make_interp_spline(nodes, np.eye(len(nodes)), k=NODE_DEGREE)
     return np.ascontiguousarray(spline(samples).T)
 
 

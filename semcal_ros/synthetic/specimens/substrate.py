@@ -31,32 +31,25 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
+from semcal_ros.synthetic.specimens.thresholds import (
+    FIBRE_ELONGATION,
+    FIBRE_LAYERS,
+    FINER_RMS,
+    FINER_SIZE,
+    GOLD_MEAN,
+    GOLD_RMS,
+    GROUND_SIZE_TEXELS,
+    GROUND_TILE,
+    REFLECTIVITY_RANGE,
+    SCRATCH_LEVELS,
+    SCRATCH_SPREAD_RAD,
+    SCRATCHES,
+)
 
 SubstrateKind = Literal["grains", "islands", "fibres", "scratches", "smooth"]
 
 #: The kinds of substrate.
 SUBSTRATES: tuple[str, ...] = get_args(SubstrateKind)
-
-# Texels along each side of a tile, and in the size of its structures: 85 of them until it repeats.
-_TILE = 2048
-_SIZE_TEXELS = 24.0
-# A second, finer layer of the same tile, so that there is structure at all magnifications: its size
-# and RMS relative to the first. With the turn, the two do not repeat together.
-_FINER = 1.0 / 5.3
-_FINER_RMS = 0.35
-# Mean and RMS of GoldOnCarbon over fields of 29 um, six seeds: 0.276 +- 0.009 and 0.205 +- 0.008.
-_GOLD_MEAN, _GOLD_RMS = 0.276, 0.205
-# Elongation of fibres: 20 times as long as wide.
-_FIBRE = 20.0
-# Directions of the fibres, each lying over the others where it is brighter.
-_FIBRE_LAYERS = 5
-# Levels of the scratches, of which more are bright than dark: burrs shine, grooves are in the shade.
-_SCRATCH_LEVELS = (-0.6, -0.35, 0.3, 0.45, 0.65, 0.8, 1.0)
-# Scratches on a tile; one polishing direction, 1-sigma around it, rad.
-_SCRATCHES = 260
-_SCRATCH_SPREAD = 0.25
-# Reflectivities a texture may reach: a real surface neither absorbs all nor shines.
-_RANGE = (0.01, 1.1)
 
 
 @dataclass(frozen=True)
@@ -114,30 +107,30 @@ class Substrate:
         """See :class:`~semcal_ros.synthetic.specimens.grid.Specimen`."""
         if self.kind == "grains":
             gold = GoldOnCarbon(self.seed, largest_m=self.size_m, octaves=4)
-            texture = (gold.reflectivity(x_m, y_m, footprint_m) - _GOLD_MEAN) / _GOLD_RMS
+            texture = (gold.reflectivity(x_m, y_m, footprint_m) - GOLD_MEAN) / GOLD_RMS
         else:
             texture = self._sample_tile(x_m, y_m, footprint_m)
         seen = np.float32(self.level) + np.float32(self.contrast) * texture
-        return np.asarray(np.clip(seen, *_RANGE), dtype=np.float32)
+        return np.asarray(np.clip(seen, *REFLECTIVITY_RANGE), dtype=np.float32)
 
     def _sample_tile(self, x_m: Array, y_m: Array, footprint_m: Array) -> Image:
         pyramid = _make_pyramid(self.kind, self.seed)
         pixel_m = math.sqrt(abs(float(np.linalg.det(footprint_m))))
         texture = np.zeros(x_m.shape, dtype=np.float32)
         rng = np.random.default_rng([self.seed, 3])
-        for factor, rms in ((1.0, 1.0), (_FINER, _FINER_RMS)):
+        for factor, rms in ((1.0, 1.0), (FINER_SIZE, FINER_RMS)):
             seen = sample_pyramid(
                 pyramid,
                 x_m,
                 y_m,
-                texel_m=factor * self.size_m / _SIZE_TEXELS,
+                texel_m=factor * self.size_m / GROUND_SIZE_TEXELS,
                 pixel_m=pixel_m,
                 angle_rad=float(rng.uniform(0.0, 2.0 * math.pi)),
                 shift=rng.uniform(0.0, 1.0, 2),
             )
             if seen is not None:
                 texture += np.float32(rms) * seen
-        return np.asarray(texture / math.hypot(1.0, _FINER_RMS), dtype=np.float32)
+        return np.asarray(texture / math.hypot(1.0, FINER_RMS), dtype=np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -158,7 +151,7 @@ def _make_pyramid(kind: str, seed: int) -> tuple[Image, ...]:
 
 def _draw_spectrum(rng: np.random.Generator) -> NDArray[np.complex64]:
     """Draw the spectrum of white noise on a tile."""
-    noise = rng.standard_normal((_TILE, _TILE), dtype=np.float32)
+    noise = rng.standard_normal((GROUND_TILE, GROUND_TILE), dtype=np.float32)
     return np.asarray(scipy.fft.rfft2(noise), dtype=np.complex64)
 
 
@@ -166,18 +159,18 @@ def _filter_noise(
     spectrum: NDArray[np.complex64], along: float, across: float, angle: float = 0.0
 ) -> Image:
     """Blur noise by two 1-sigmas (texels) along and across a direction; RMS 1."""
-    v = np.fft.fftfreq(_TILE)[:, None].astype(np.float32)
-    u = np.fft.rfftfreq(_TILE)[None, :].astype(np.float32)
+    v = np.fft.fftfreq(GROUND_TILE)[:, None].astype(np.float32)
+    u = np.fft.rfftfreq(GROUND_TILE)[None, :].astype(np.float32)
     c, s = math.cos(angle), math.sin(angle)
     power = (along * (c * u + s * v)) ** 2 + (across * (c * v - s * u)) ** 2
     filtered = spectrum * np.exp(np.float32(-2.0 * math.pi**2) * power)
-    noise = np.asarray(scipy.fft.irfft2(filtered, s=(_TILE, _TILE)), dtype=np.float32)
+    noise = np.asarray(scipy.fft.irfft2(filtered, s=(GROUND_TILE, GROUND_TILE)), dtype=np.float32)
     return noise / noise.std()
 
 
 def _draw_islands(rng: np.random.Generator) -> Image:
     """Patches with flat tops and borders two texels wide, between bare channels."""
-    sigma = 0.4 * _SIZE_TEXELS  # the patches of thresholded noise are some 2.5 sigma wide
+    sigma = 0.4 * GROUND_SIZE_TEXELS  # the patches of thresholded noise are some 2.5 sigma wide
     field = _filter_noise(_draw_spectrum(rng), sigma, sigma)
     # The slope of the noise is 1 / sigma per texel.
     patches = 1.0 / (1.0 + np.exp(-np.clip((field - 0.2) * sigma, -30.0, 30.0)))
@@ -186,23 +179,32 @@ def _draw_islands(rng: np.random.Generator) -> Image:
 
 
 def _draw_fibres(rng: np.random.Generator) -> Image:
-    width = _SIZE_TEXELS / 6.0
-    turns = rng.uniform(0.0, math.pi) + math.pi * np.arange(_FIBRE_LAYERS) / _FIBRE_LAYERS
+    width = GROUND_SIZE_TEXELS / 6.0
+    turns = rng.uniform(0.0, math.pi) + math.pi * np.arange(FIBRE_LAYERS) / FIBRE_LAYERS
     # The filters have little in common, so the layers may come from the same noise.
     spectrum = _draw_spectrum(rng)
-    layers = [_filter_noise(spectrum, _FIBRE * width, width, float(turn)) for turn in turns]
+    layers = [
+        _filter_noise(spectrum, FIBRE_ELONGATION * width, width, float(turn)) for turn in turns
+    ]
     return np.asarray(np.max(layers, axis=0), dtype=np.float32)
 
 
 def _draw_scratches(rng: np.random.Generator) -> Image:
-    tile = np.zeros((_TILE, _TILE), dtype=np.float32)
+    tile = np.zeros((GROUND_TILE, GROUND_TILE), dtype=np.float32)
     main = rng.uniform(0.0, math.pi)
-    corners = np.array([[x, y] for x in (-_TILE, 0, _TILE) for y in (-_TILE, 0, _TILE)])
-    for level in _SCRATCH_LEVELS:
+    corners = np.array(
+        [[x, y] for x in (-GROUND_TILE, 0, GROUND_TILE) for y in (-GROUND_TILE, 0, GROUND_TILE)]
+    )
+    for level in SCRATCH_LEVELS:
         lines = np.zeros_like(tile)
-        for _ in range(_SCRATCHES // len(_SCRATCH_LEVELS)):
-            centre, turn = rng.uniform(0.0, _TILE, 2), rng.normal(main, _SCRATCH_SPREAD)
-            half = 0.5 * rng.uniform(0.1, 0.6) * _TILE * np.array([math.cos(turn), math.sin(turn)])
+        for _ in range(SCRATCHES // len(SCRATCH_LEVELS)):
+            centre, turn = rng.uniform(0.0, GROUND_TILE, 2), rng.normal(main, SCRATCH_SPREAD_RAD)
+            half = (
+                0.5
+                * rng.uniform(0.1, 0.6)
+                * GROUND_TILE
+                * np.array([math.cos(turn), math.sin(turn)])
+            )
             width = int(rng.integers(2, 7))
             for corner in corners:
                 ends = np.rint(16.0 * (centre + corner + np.stack([-half, half]))).astype(int)
@@ -214,5 +216,5 @@ def _draw_scratches(rng: np.random.Generator) -> Image:
 
 
 def _draw_smooth(rng: np.random.Generator) -> Image:
-    sigma = 2.0 * _SIZE_TEXELS
+    sigma = 2.0 * GROUND_SIZE_TEXELS
     return _filter_noise(_draw_spectrum(rng), sigma, sigma)

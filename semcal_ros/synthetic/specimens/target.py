@@ -23,14 +23,14 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from semcal_ros.applications.servoing.target import CELLS, MARKER_BITS, RATIO, SIDE, NestedTarget
+from semcal_ros.applications.servoing.target import CELLS, NestedTarget
+from semcal_ros.applications.servoing.thresholds import MARKER_BITS, MARKER_SIDE, RATIO
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.cantilever import NO_CHARGING, Charging
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
+from semcal_ros.synthetic.specimens.thresholds import BIT_TEXELS
 
-# Texels per cell: seven for each square of a marker, and nine for the white on either side.
-_TEXELS_PER_BIT = 7
-_CELL = round(MARKER_BITS * _TEXELS_PER_BIT / SIDE)
+_CELL = round(MARKER_BITS * BIT_TEXELS / MARKER_SIDE)
 
 
 @dataclass(frozen=True)
@@ -158,10 +158,10 @@ def _make_pyramid(target: NestedTarget, level: int) -> tuple[Image, ...]:
 def _draw_board(target: NestedTarget, level: int) -> Image:
     """(3 cells, 3 cells) texels."""
     board = np.ones((RATIO * _CELL, RATIO * _CELL), dtype=np.float32)
-    border = (_CELL - MARKER_BITS * _TEXELS_PER_BIT) // 2
+    border = (_CELL - MARKER_BITS * BIT_TEXELS) // 2
     for place, (column, row) in enumerate(CELLS):
         bits = target.bits(len(CELLS) * level + place).astype(np.float32)
-        marker = np.kron(bits, np.ones((_TEXELS_PER_BIT, _TEXELS_PER_BIT), dtype=np.float32))
+        marker = np.kron(bits, np.ones((BIT_TEXELS, BIT_TEXELS), dtype=np.float32))
         top, left = ((c + 1) * _CELL + border for c in (row, column))
         board[top : top + len(marker), left : left + len(marker)] = marker
     if level + 1 < target.levels:

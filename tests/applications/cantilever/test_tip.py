@@ -39,7 +39,7 @@ LENGTH_M, WIDTH_M = 35e-6, 3e-6
 END_PX = 170
 
 
-def pixels(tip, seed, ground="islands"):
+def pixels(tip, seed, ground="islands", rim=0.12):
     """Pixels around the end of a beam, in coordinates along and across its axis, and the end itself."""
     rng = np.random.default_rng([seed, 5])
     end_m = rng.uniform(-0.5, 0.5) * PIXEL_M
@@ -51,6 +51,7 @@ def pixels(tip, seed, ground="islands"):
         length_m=LENGTH_M,
         width_m=WIDTH_M,
         tip=tip,
+        rim=rim,
         substrate=Substrate(ground, 0.2, 0.08, 1.5e-6, seed),
     )
     light = scene.reflectivity(x + LENGTH_M - end_m, y.copy(), PIXEL_M * np.eye(2))
@@ -59,9 +60,9 @@ def pixels(tip, seed, ground="islands"):
     return (x[inner, inner].ravel(), y[inner, inner].ravel(), grey.ravel()), end_m
 
 
-def fitted(tip, seed, ground="islands"):
+def fitted(tip, seed, ground="islands", rim=0.12):
     """The fit and the error of its apex; the search starts where the edges of the strip would end."""
-    samples, end_m = pixels(tip, seed, ground)
+    samples, end_m = pixels(tip, seed, ground, rim)
     apex_m = find_apex(samples, -tip.length_m, 0.5 * WIDTH_M, PIXEL_M)
     model = EdgeModel(1.1 * PIXEL_M, 6.0 * PIXEL_M, -6e-6, 12.0 * PIXEL_M, 9, 0.5 * WIDTH_M)
     fit = fit_tip(samples, apex_m, model, PIXEL_M)
@@ -82,6 +83,20 @@ def test_the_apex_is_where_it_is_and_as_good_as_it_says(name):
         assert fit.flank_m > tip.length_m - 5.0 * PIXEL_M
     assert np.max(np.abs(errors)) < 0.5 * PIXEL_M
     assert np.max(np.abs(deviations)) < 3.0
+
+
+@pytest.mark.slow
+def test_a_bright_rim_is_in_the_uncertainty():
+    """The model of an edge has none: it pulls the apex outwards, and the farther the fit reaches, the more."""
+    made = [make_tip(name, WIDTH_M, np.random.default_rng(0)) for name in TIPS]
+    bright, none = ([fitted(tip, 0, rim=rim) for tip in made] for rim in (0.3, 0.0))
+    # One alike over all tips: 0.2 px, where noise would have moved it by less than a tenth.
+    assert np.mean([error for _, error in bright]) > 0.1 * PIXEL_M
+    assert abs(np.mean([error for _, error in none])) < 0.1 * PIXEL_M
+    deviations = np.array([error / fit.sigma_m for fit, error in bright])
+    assert np.sqrt(np.mean(deviations**2)) < 2.0
+    sigmas_m = [np.mean([fit.sigma_m for fit, _ in fits]) for fits in (bright, none)]
+    assert sigmas_m[0] > 1.3 * sigmas_m[1]
 
 
 def test_a_pointed_tip_ends_at_its_point():

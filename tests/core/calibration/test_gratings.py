@@ -24,7 +24,8 @@ import pytest
 
 from benchmarks.calibration.gratings import DISPLAY_WIDTH_M, Array, Microscope, draw_picture
 from semcal_ros.core.calibration.judgement.check import Verdict
-from semcal_ros.core.calibration.judgement.plan import PLANNED_DIRECTIONS_RAD, judge_calibration
+from semcal_ros.core.calibration.judgement.plan import judge_calibration
+from semcal_ros.core.calibration.judgement.thresholds import PLANNED_DIRECTIONS_RAD
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView

@@ -21,12 +21,12 @@ import pytest
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.acquisition import (
-    PROBE_SQUARES,
     find_stage_move,
     grid_is_centred,
     image_from_stage,
     lattice_shift,
 )
+from semcal_ros.core.calibration.thresholds import PROBE_SQUARES
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError
 

@@ -21,8 +21,8 @@ from collections.abc import Callable
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.thresholds import DAMPING_MIN
 from semcal_ros.core.calibration.estimator.trust_region import (
-    MIN_DAMPING,
     Descent,
     DescentStatus,
     Step,
@@ -59,6 +59,6 @@ def test_a_damped_first_step_may_pass_for_the_last() -> None:
 
 def test_without_damping_and_with_a_limit_of_what_is_predicted_the_end_is_the_minimum() -> None:
     # 1e-10 half chi-squares are 1e-5 sigma.
-    found = run(predicted=1e-10, first_damping=MIN_DAMPING)
+    found = run(predicted=1e-10, first_damping=DAMPING_MIN)
     assert found.status is DescentStatus.SMALL_DECREASE
     np.testing.assert_allclose(found.state, 0.0, atol=1e-5)

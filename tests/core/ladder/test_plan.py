@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.ladder.matching import LARGEST_STEP
 from semcal_ros.core.ladder.plan import plan_ladder
+from semcal_ros.core.ladder.thresholds import STEP_MAX
 from tests.helpers.ladders import calibration_of, make_scope
 
 
@@ -35,7 +35,7 @@ def test_a_ladder_begins_inside_the_range_and_has_no_gap(last: float) -> None:
     # Three steps inside, so that no single visit carries the scale.
     assert np.count_nonzero((seen >= 0.999 * low) & (seen <= 1.001 * high)) >= 3
     ratios = np.exp(np.abs(np.diff(np.log(seen))))
-    assert np.all(ratios < LARGEST_STEP)
+    assert np.all(ratios < STEP_MAX)
     for step in steps:
         assert step.field_m == pytest.approx(model.display_width_m / step.magnification)
         for x, y in step.moves_m[1:]:

@@ -53,13 +53,19 @@ from semcal_ros.core.calibration.estimator.residuals import (
     view_residuals,
     whitened_norm,
 )
-from semcal_ros.core.calibration.estimator.trust_region import (
+from semcal_ros.core.calibration.estimator.thresholds import (
+    COST_TOLERANCE,
+    DAMPING_MIN,
     FIRST_DAMPING,
-    MIN_DAMPING,
-    DescentStatus,
-    Step,
-    descend,
+    FIT_STEPS_MAX,
+    FOLLOWING_STEPS,
+    NEGLIGIBLE_CHANGE,
+    NOTHING_DECREASE,
+    POOR_GAIN,
+    ROTATION_STEP_MAX_RAD,
+    ROUNDING_DAMPING,
 )
+from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, Step, descend
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
@@ -73,25 +79,6 @@ __all__ = [
     "variance_factor",
     "weighted_squares",
 ]
-
-
-# A guard against endless iteration; the result says where it was reached.
-_MAX_ITERATIONS = 60
-# Ratio of actual to predicted decrease below which the quadratic model of a view has failed.
-_POOR_GAIN = 0.25
-# Steps by which the pose of such a view follows a new camera. It has to be near only: the next
-# iteration continues from there.
-_FOLLOWING_STEPS = 6
-# Change of a view's half chi-square that does not count as a failure.
-_NEGLIGIBLE = 1e-2
-# Longest step of a rotation vector, rad: farther away, the equations say nothing.
-_LARGEST_TURN = 0.5
-# Damping that makes up for what rounding takes from the equations: it changes no sigma in the first five digits.
-_ROUNDING = 1e-10
-# Decrease of half chi-square in a step that changes nothing: it moves an unknown by 0.004 of its sigma.
-_NOTHING = 1e-5
-# Relative decrease of the cost below which another step cannot matter to the result.
-_COST_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -153,7 +140,7 @@ class BundleResult:
         """
         ended = self.status in (DescentStatus.SMALL_DECREASE, DescentStatus.NO_DESCENT)
         slow = self.status is DescentStatus.ITERATION_LIMIT
-        ended |= slow and 0.0 < self.last_decrease * self.cost < _NOTHING
+        ended |= slow and 0.0 < self.last_decrease * self.cost < NOTHING_DECREASE
         return ended and not np.any(self.lost)
 
     @property
@@ -202,7 +189,7 @@ def _change(
     camera, visits, views = reduced.back(problem, change)
     if not (np.all(np.isfinite(change)) and np.all(np.isfinite(views))):
         return None
-    if np.any(np.abs(views[:, problem.layout.of_view["view.turn"]]) > _LARGEST_TURN):
+    if np.any(np.abs(views[:, problem.layout.of_view["view.turn"]]) > ROTATION_STEP_MAX_RAD):
         return None
     new = retract(problem, state, change, views, visits)
     parts = (
@@ -226,8 +213,8 @@ def refine(
     state: State,
     *,
     fixed_theta: bool = False,
-    max_iterations: int = _MAX_ITERATIONS,
-    tolerance: float = _COST_TOLERANCE,
+    max_iterations: int = FIT_STEPS_MAX,
+    tolerance: float = COST_TOLERANCE,
     predicted: float | None = None,
     first_damping: float = FIRST_DAMPING,
 ) -> BundleResult:
@@ -293,12 +280,12 @@ def _follow_with_poses(problem: Problem, costs: Array, step: _Change) -> _Point:
     """
     trial = step.state
     trial_costs = view_costs(problem, trial)
-    short = trial_costs > costs - _POOR_GAIN * step.predicted + _NEGLIGIBLE
+    short = trial_costs > costs - POOR_GAIN * step.predicted + NEGLIGIBLE_CHANGE
     if not np.any(short):
         return _Point(trial, trial_costs)
     part = select_views(problem, short)
     start = states_of(trial, short)
-    own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], _FOLLOWING_STEPS, 1e-3)
+    own, own_costs, _, _ = _refine_poses(part, start, trial_costs[short], FOLLOWING_STEPS, 1e-3)
     trial_costs[short] = own_costs
     return _Point(with_states_of(trial, short, own), trial_costs)
 
@@ -330,7 +317,7 @@ def _refine_poses(
         decrease = np.where(better, costs - trial_costs, 0.0)
         state = pick_views(better, trial, state)
         costs = np.where(better, trial_costs, costs)
-        damping = np.where(better, np.maximum(0.1 * damping, MIN_DAMPING), 10.0 * damping)
+        damping = np.where(better, np.maximum(0.1 * damping, DAMPING_MIN), 10.0 * damping)
         predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, own], change)
         small = tolerance * (1.0 + costs)
         if np.all(np.where(better, decrease, predicted) <= small):
@@ -347,7 +334,7 @@ def _make_result(
     last_decrease: float,
 ) -> BundleResult:
     normal = normal_equations(problem, state)
-    for damping in (0.0, _ROUNDING):
+    for damping in (0.0, ROUNDING_DAMPING):
         with suppress(np.linalg.LinAlgError):
             reduced = schur_complement(problem, state, normal, damping)
             matrix, _ = reduced_normal_equations(

@@ -42,6 +42,14 @@ from semcal_ros.core.calibration.estimator.problem import (
     with_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residuals import view_residuals
+from semcal_ros.core.calibration.estimator.thresholds import (
+    COARSE_TOLERANCE,
+    DECREASE_MIN,
+    MIRROR_ROUNDS,
+    POSE_CORNERS,
+    POSE_STEPS,
+    WIDE_RATIO,
+)
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import names_of
 from semcal_ros.core.camera.plane_geometry import (
@@ -56,8 +64,6 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.wording import counted
 
 __all__ = [
-    "COARSE",
-    "LEAST_DECREASE",
     "InitialValues",
     "adjust",
     "adjust_with_other_poses",
@@ -71,10 +77,6 @@ __all__ = [
     "thin_view",
     "try_other_poses",
 ]
-
-# Ratio of the field width to the distance of the pivot. Noise and distortion imitate a few hundredths; an SEM at 100x
-# has 0.06 to 0.15, at 60x with a pivot of 4 mm 0.5, and a photographic lens about 1.
-_WIDE = 0.7
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def initial_values(
 
 
 def _is_wide(rho: float, field_m: float) -> bool:
-    return bool(rho * field_m > _WIDE)
+    return bool(rho * field_m > WIDE_RATIO)
 
 
 def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
@@ -181,25 +183,12 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
 
 # Shared unknowns that change their sign when everything is mirrored in the reference plane.
 _ODD = ("grid_curvature_m", "axis_z_m", "stage_wedge_x", "stage_wedge_y")
-# Half a turn, after which a tilt about the axis has the other sign.
-_HALF_TURN = np.pi
-# Rounds of turning views over. Each follows an adjustment to the last one, and the rounds end when
-# no view turns.
-_MAX_TURNS = 5
-LEAST_DECREASE = 0.1
-"""Least decrease of a sum of squares, in sigmas, that makes another pose of a view: what few steps leave is less."""
-# Steps from either sign of a tilt, enough to say which fits better; the adjustment does the rest.
-_POSE_ITERATIONS = 12
-# Tolerance of the intermediate adjustments; only the last one needs to be exact.
-COARSE = 1e-6
-# Corners per view for what only needs to be near: signs of tilts, poses, start functions.
-_ENOUGH_CORNERS = 60
 
 
 def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> BundleResult:
     """Refine, and turn views to their mirrored tilt as long as that fits better."""
     result = refine(problem, state, tolerance=tolerance)
-    for _ in range(_MAX_TURNS):
+    for _ in range(MIRROR_ROUNDS):
         turned, changed = resolve_mirrored_tilts(problem, result.state)
         if not changed:
             break
@@ -209,7 +198,7 @@ def adjust(problem: Problem, state: State, *, tolerance: float = 1e-9) -> Bundle
 
 def refine_coarsely(problem: Problem, state: State) -> BundleResult:
     """Adjust as exactly as what comes between needs."""
-    return refine(problem, state, tolerance=COARSE)
+    return refine(problem, state, tolerance=COARSE_TOLERANCE)
 
 
 def mirror(functions: Functions, problem: Problem, state: State) -> State:
@@ -227,7 +216,7 @@ def mirror(functions: Functions, problem: Problem, state: State) -> State:
         if name in _ODD:
             theta[k] *= -1.0
         elif name == "stage_axis":
-            theta[k] -= np.copysign(_HALF_TURN, theta[k])
+            theta[k] -= np.copysign(np.pi, theta[k])
     flip = np.array([1.0, 1.0, -1.0])
     visits = state.visits * [1.0, -1.0] if len(state.visits) else state.visits
     return replace(
@@ -249,9 +238,9 @@ def right_way_up(
     """
     rho = with_coefficients(functions, result.state.theta)["rho"](setup.magnifications[0])
     axis = problem.shared_values(result.state.theta, ["stage_axis"])[0]
-    if rho >= 0.0 and abs(axis) <= 0.5 * _HALF_TURN:
+    if rho >= 0.0 and abs(axis) <= 0.5 * np.pi:
         return result
-    other = refine(problem, mirror(functions, problem, result.state), tolerance=COARSE)
+    other = refine(problem, mirror(functions, problem, result.state), tolerance=COARSE_TOLERANCE)
     return other if other.cost < result.cost else result
 
 
@@ -263,9 +252,9 @@ def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
     # Turning about the middle of the visible points keeps the view in place.
     moved = np.einsum("vij,vj->vi", state.rotations - rotations, middle)
     mirrored = replace(state, rotations=rotations, translations_m=state.translations_m + moved)
-    own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-    other = refine(problem, mirrored, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
-    better = _view_costs(problem, other) < _view_costs(problem, own) - LEAST_DECREASE
+    own = refine(problem, state, fixed_theta=True, max_iterations=POSE_STEPS)
+    other = refine(problem, mirrored, fixed_theta=True, max_iterations=POSE_STEPS)
+    better = _view_costs(problem, other) < _view_costs(problem, own) - DECREASE_MIN
     return pick_views(better, other.state, own.state), int(better.sum())
 
 
@@ -277,7 +266,7 @@ def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, 
     """
     table = problem.cameras(state.theta)
     count = 0
-    own = refine(problem, state, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
+    own = refine(problem, state, fixed_theta=True, max_iterations=POSE_STEPS)
     best = own.state
     costs = _view_costs(problem, own)
     starts = [
@@ -296,9 +285,9 @@ def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, 
             drift_px=np.zeros_like(state.drift_px),
             lattices=np.zeros_like(state.lattices),
         )
-        other = refine(problem, fresh, fixed_theta=True, max_iterations=_POSE_ITERATIONS)
+        other = refine(problem, fresh, fixed_theta=True, max_iterations=POSE_STEPS)
         other_costs = _view_costs(problem, other)
-        better = other_costs < costs - LEAST_DECREASE
+        better = other_costs < costs - DECREASE_MIN
         best, costs = pick_views(better, other.state, best), np.where(better, other_costs, costs)
         count += int(better.sum())
     return best, count
@@ -335,9 +324,9 @@ def thin_view(view: GridView) -> GridView:
 
     Lines stay whole: a single place says where they are along their direction.
     """
-    if len(view.board_xy_m) <= _ENOUGH_CORNERS or view.across is not None:
+    if len(view.board_xy_m) <= POSE_CORNERS or view.across is not None:
         return view
-    keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:_ENOUGH_CORNERS]
+    keep = np.random.default_rng(0).permutation(len(view.board_xy_m))[:POSE_CORNERS]
     return view.chosen(keep)
 
 
@@ -364,10 +353,10 @@ def adjust_with_other_poses(
 ) -> tuple[BundleResult, int]:
     """Adjust, and adjust to other poses as long as some fit better; return how many did."""
     result, total = right_way_up(setup, functions, problem, refine_coarsely(problem, state)), 0
-    for _ in range(_MAX_TURNS):
+    for _ in range(MIRROR_ROUNDS):
         state, count = try_other_poses(setup, functions, spread, result.state)
         other = refine_coarsely(problem, state) if count else result
-        if other.cost > result.cost - LEAST_DECREASE:
+        if other.cost > result.cost - DECREASE_MIN:
             # Better for some of the corners, and not for all.
             break
         result, total = other, total + count

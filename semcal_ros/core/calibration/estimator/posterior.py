@@ -58,6 +58,22 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     solve_field,
 )
 from semcal_ros.core.calibration.estimator.residuals import corner_rows
+from semcal_ros.core.calibration.estimator.thresholds import (
+    ALONG_LINE_MIN,
+    CERTAINTY_STEP,
+    CHANGE_LIMITS,
+    CHANGE_UPDATES,
+    HELD_PART,
+    JITTER_GAIN,
+    JITTER_LENGTHS,
+    LAG_MAX,
+    LAG_PAIRS_MIN,
+    NAMED_MAX,
+    REMAINING_MAX,
+    RESERVE_SIZE,
+    RESERVE_SIZE_MIN,
+    USUAL_CHANGES,
+)
 from semcal_ros.core.camera.calibration_model import names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.fit_record import Certificate
@@ -76,16 +92,6 @@ __all__ = [
     "pattern_covariance",
     "split_covariance",
 ]
-
-# Of an unknown that is still on its way, in sigmas: far beyond what the last step of a converged fit leaves, which is
-# some hundredths.
-_LARGEST_REMAINING = 1.0
-# Part of the prior variance of a constant beyond which the prior holds it.
-_HELD = 0.64
-_NAMED = 3
-# Square of the cosine between a line of the raster and the direction in which a point is known, below which a shift
-# along the line hardly shows there.
-_TELLING = 0.5
 
 
 def certify(functions: Functions, problem: Problem, result: BundleResult) -> Certificate:
@@ -115,10 +121,10 @@ def certify(functions: Functions, problem: Problem, result: BundleResult) -> Cer
             do="record views with more tilt, at more magnifications",
         )
     remaining = np.abs(solve_scaled(matrix, right)) / sigmas
-    if float(remaining.max()) > _LARGEST_REMAINING:
-        worst = [names[k] for k in np.argsort(-remaining) if remaining[k] > _LARGEST_REMAINING]
+    if float(remaining.max()) > REMAINING_MAX:
+        worst = [names[k] for k in np.argsort(-remaining) if remaining[k] > REMAINING_MAX]
         raise UnusableCalibrationError(
-            f"a fit that is not at a minimum: {', '.join(list(dict.fromkeys(worst))[:_NAMED])} would still move by "
+            f"a fit that is not at a minimum: {', '.join(list(dict.fromkeys(worst))[:NAMED_MAX])} would still move by "
             f"{remaining.max():.1f} sigma",
             expected="views of one flat grid, by one microscope, at the magnifications that are stated",
             do="leave out views that are not such, or record more",
@@ -126,7 +132,7 @@ def certify(functions: Functions, problem: Problem, result: BundleResult) -> Cer
     held, start = [], 0
     for name in names_of(functions):
         prior = problem.prior_sigma[start]
-        if np.isfinite(prior) and result.covariance[start, start] > _HELD * prior**2:
+        if np.isfinite(prior) and result.covariance[start, start] > (HELD_PART * prior) ** 2:
             held.append(name)
         start += functions[name].size
     return Certificate(
@@ -135,17 +141,6 @@ def certify(functions: Functions, problem: Problem, result: BundleResult) -> Cer
         condition=float(values[-1] / values[0]),
         held=tuple(held),
     )
-
-
-# Lengths of correlation that are tried, lines: hardly more than one line, that of one corner's window,
-# and multiples of it up to a quarter of a small image. Longer ones look like a drift.
-_LENGTHS = (0.4, 1.5, 6.0, 24.0)
-# Products of residuals are compared up to this many lines apart.
-_MOST_LAG = 64
-# Improvement in chi-squares below which there is no jitter: three standard deviations.
-_SIGNIFICANT = 9.0
-# Least sum of weights with which a lag is compared.
-_ENOUGH_PAIRS = 20.0
 
 
 @dataclass(frozen=True)
@@ -192,7 +187,7 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
 
     The result is without parts where nothing significant is found.
     """
-    product, pairs = np.zeros(_MOST_LAG), np.zeros(_MOST_LAG)
+    product, pairs = np.zeros(LAG_MAX), np.zeros(LAG_MAX)
     squares, used = 0.0, 0.0
     for part in _views(problem):
         inlier = result.huber_weight[part] >= 1.0
@@ -200,12 +195,12 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
         if problem.across is not None:
             # A shift of a line of the raster shows by its part across the lines of the grating.
             by_x = problem.across[part, 0] ** 2
-            inlier = inlier & (by_x > _TELLING)
-            x = x / np.maximum(by_x, _TELLING)
+            inlier = inlier & (by_x > ALONG_LINE_MIN)
+            x = x / np.maximum(by_x, ALONG_LINE_MIN)
         x = np.where(inlier, x, 0.0)
         line = _lines(problem, part)
         sums, counts = (np.bincount(line, weights=w) for w in (x, inlier.astype(float)))
-        own = min(len(sums), _MOST_LAG)
+        own = min(len(sums), LAG_MAX)
         for k in range(own):
             product[k] += sums[k:] @ sums[: len(sums) - k]
             pairs[k] += counts[k:] @ counts[: len(counts) - k]
@@ -216,20 +211,20 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
         used += float(inlier.sum())
     product[0] *= 0.5
     pairs[0] *= 0.5
-    known = pairs >= _ENOUGH_PAIRS
+    known = pairs >= LAG_PAIRS_MIN
     if not np.any(known):
         return LineJitter()
-    lag = np.arange(_MOST_LAG)[known]
+    lag = np.arange(LAG_MAX)[known]
     variance = squares / max(used, 1.0)
     weight = np.sqrt(pairs[known]) / variance
     target = product[known] / pairs[known] * weight
     # What is nearly gone at the least distance that was compared would take any variance.
-    lengths = [s for s in _LENGTHS if s >= lag[0]]
+    lengths = [s for s in JITTER_LENGTHS if s >= lag[0]]
     if not lengths:
         return LineJitter()
     design = np.stack([np.exp(-0.5 * (lag / s) ** 2) for s in lengths], axis=1) * weight[:, None]
     found, left = nnls(design, target)
-    if float(target @ target) - left**2 < _SIGNIFICANT:
+    if float(target @ target) - left**2 < JITTER_GAIN:
         return LineJitter()
     parts = [(float(v), s) for v, s in zip(found, lengths, strict=True) if v > 0.0]
     return LineJitter(tuple(v for v, _ in parts), tuple(s for _, s in parts))
@@ -285,19 +280,6 @@ def _positive_part(matrix: Array) -> Array:
     scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
-
-
-# Number of zero coefficients that are added to the chosen ones, and the least number in all: what
-# the views leave open of them enters the covariance.
-_RESERVE, _LEAST_SIZE = 2, 5
-# Weight of the usual size of the changes of a function, against one coefficient that the views determine: two of them
-# make it half as large at the least, so that few magnifications which happen to agree do not promise too much.
-_USUAL_CHANGES = 0.5
-# Limits of the size of the changes, relative to the usual one, and updates until it changes by a few per cent.
-_CHANGE_LIMITS = (0.1, 3.0)
-_CHANGE_UPDATES = 5
-# Step of a central difference: its error is the square of this, far below what a share is worth.
-_CERTAINTY_STEP = 0.02
 
 
 @dataclass(frozen=True)
@@ -369,7 +351,7 @@ def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
         if name not in functions:
             continue
         own = functions[name]
-        size = max(own.smooth_size + _RESERVE, _LEAST_SIZE)
+        size = max(own.smooth_size + RESERVE_SIZE, RESERVE_SIZE_MIN)
         smooth, jumps = np.split(own.coefficients, [own.smooth_size])
         zeros = np.zeros(size - own.smooth_size)
         out[name] = replace(own, coefficients=np.concatenate([smooth, zeros, jumps]))
@@ -384,7 +366,7 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
     but the first, in prior sigmas, over the number of them that the views determine.
     """
     sigma, theta = problem.prior_sigma.copy(), result.state.theta
-    for _ in range(_CHANGE_UPDATES):
+    for _ in range(CHANGE_UPDATES):
         known = replace(problem, prior_sigma=sigma)
         matrix, right = reduced_normal_equations(known, theta, result.information, result.gradient)
         freed = theta + solve_scaled(matrix, right)
@@ -398,8 +380,8 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
             usual = problem.prior_sigma[own]
             square = float(np.sum((freed[own] / usual) ** 2))
             determined = float(np.sum(np.maximum(1.0 - variance[own] / sigma[own] ** 2, 0.0)))
-            ratio = np.sqrt((square + _USUAL_CHANGES) / (determined + _USUAL_CHANGES))
-            sigma[own] = usual * np.clip(ratio, *_CHANGE_LIMITS)
+            ratio = np.sqrt((square + USUAL_CHANGES) / (determined + USUAL_CHANGES))
+            sigma[own] = usual * np.clip(ratio, *CHANGE_LIMITS)
     return sigma
 
 
@@ -449,8 +431,8 @@ def split_covariance(padded: PaddedAdjustment) -> CovarianceParts:
         return refine(scaled, state, max_iterations=0).covariance
 
     whole = padded.result.covariance
-    corners = (covariance(1.0 - _CERTAINTY_STEP) - covariance(1.0 + _CERTAINTY_STEP)) / (
-        4.0 * _CERTAINTY_STEP
+    corners = (covariance(1.0 - CERTAINTY_STEP) - covariance(1.0 + CERTAINTY_STEP)) / (
+        4.0 * CERTAINTY_STEP
     )
     left = _left_out(padded.chosen.functions, padded.functions)
     omitted = (whole[:, left] / problem.prior_sigma[left] ** 2) @ whole[left]

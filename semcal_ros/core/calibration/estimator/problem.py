@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.estimator.blocks import (
     State,
     make_problem,
 )
+from semcal_ros.core.calibration.estimator.thresholds import REFERENCE_WIDTH_PX
 from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
@@ -47,8 +48,6 @@ from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
 
 __all__ = [
-    "HELD_SIGMA",
-    "REFERENCE_WIDTH_PX",
     "Functions",
     "Priors",
     "Setup",
@@ -65,11 +64,6 @@ __all__ = [
     "with_shared",
     "with_shared_values",
 ]
-
-HELD_SIGMA = 1e-9
-"""Prior 1-sigma that holds an unknown at its mean."""
-REFERENCE_WIDTH_PX = 512
-"""Width of an image for which lengths in px among the priors are meant; they grow with the image."""
 
 
 # The amplifiers of the scan change these at a breakpoint.

@@ -32,21 +32,32 @@ from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_sca
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, variance_factor
 from semcal_ros.core.calibration.estimator.normal_equations import sum_by
-from semcal_ros.core.calibration.estimator.problem import (
-    REFERENCE_WIDTH_PX,
-    Setup,
-)
+from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
     stack_rows,
     view_residuals,
     whiten,
 )
+from semcal_ros.core.calibration.estimator.thresholds import (
+    COEFFICIENTS_IN_G_MAX,
+    FIELD_GAIN_SIGMAS,
+    FIELD_SIZE_MIN,
+    FOLDS_MAX,
+    GAINING_PART,
+    MAGNIFICATIONS_MIN,
+    NO_STRENGTH_PX,
+    OVERLAP_PX,
+    REFERENCE_WIDTH_PX,
+    RIDGES,
+    SMOOTHNESS,
+    STEADINESS,
+    STRENGTHS_PX,
+)
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.errors import UnusableCalibrationError
 
 __all__ = [
-    "ENOUGH_MAGNIFICATIONS",
     "FieldChoice",
     "FieldSystem",
     "FittedField",
@@ -58,34 +69,6 @@ __all__ = [
     "solve_field",
     "undo_field",
 ]
-
-
-# Standard deviations of a coefficient that are tried, px in a picture of the reference width: from less than the noise
-# to a camera lens. Distortion grows with the picture.
-_STRENGTHS_PX = (0.05, 0.3, 2.0, 12.0)
-# A prior this narrow holds the field at zero; the same equations then serve without a field.
-_NO_STRENGTH_PX = 1e-7
-# Ratio of the coefficients to their second differences: fields are smooth.
-_SMOOTHNESS = 4.0
-# Ratio of the coefficients to their differences between neighbours in log g.
-_STEADINESS = 3.0
-# Prior standard deviation of the part of the field that the rest of the model describes, px.
-_OVERLAP_PX = 1e-4
-# The field is taken to change slowly with the magnification: as a parabola in log g at most.
-_MAX_COEFFICIENTS_IN_G = 5
-#: Fewer magnifications do not predict one that is left out.
-ENOUGH_MAGNIFICATIONS = 4
-# Bounds the time: every fold is solved once for each strength.
-_MAX_FOLDS = 6
-# Ridges that are tried in turn, relative to the diagonal: what elimination by subtraction loses.
-_RIDGES = (0.0, 1e-12, 1e-10, 1e-8)
-# Least gain of a worthwhile field, in held-out half chi-squares and in standard errors.
-_LEAST_GAIN, _CLEARLY = 6.0, 2.5
-# Least RMS size of a field at the corners, in sigmas of a corner: a smaller one costs more certainty, where there are
-# no corners, than it is worth.
-_LEAST_SIGMAS = 0.15
-# Part of the members that must gain: what is in a few of them only is no distortion of the microscope.
-_MOST_MEMBERS = 2.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -172,7 +155,7 @@ class FieldSystem:
 
 def _cholesky(scaled: Array) -> tuple[Array, bool]:
     """Factor a matrix with ones on its diagonal, which rounding may have taken out of the positive definite ones."""
-    for ridge in _RIDGES:
+    for ridge in RIDGES:
         with suppress(np.linalg.LinAlgError):
             factor: tuple[Array, bool] = cho_factor(
                 scaled + ridge * np.eye(len(scaled)), check_finite=False
@@ -214,7 +197,7 @@ class FieldChoice:
 def blank_field(setup: Setup) -> ResidualField:
     """Make a field without displacement for the magnifications of these views."""
     g = setup.magnifications
-    count = min(_MAX_COEFFICIENTS_IN_G, len(g))
+    count = min(COEFFICIENTS_IN_G_MAX, len(g))
     return zero_field(setup.image_size, (float(g[0]), float(g[-1])), count)
 
 
@@ -275,7 +258,7 @@ def field_system(
         own = corners.rows[:, :, part]
         x, y = np.concatenate([own[:, :-1], rows, own[:, -1:]], axis=1)
         augmented[v][np.ix_(observed, observed)] += x @ x.T + y @ y.T
-    few = len(setup.magnifications) < ENOUGH_MAGNIFICATIONS
+    few = len(setup.magnifications) < MAGNIFICATIONS_MIN
     if few and scaled.effects is not None:
         # The members are views: each is taken for a visit of its own.
         own_visit = np.arange(len(setup.views), dtype=np.intp)
@@ -354,10 +337,10 @@ def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
     bent = np.kron(np.eye(ny), _second_differences(nx)) + np.kron(
         _second_differences(ny), np.eye(nx)
     )
-    smooth = (np.eye(ny * nx) + _SMOOTHNESS**2 * bent) * (norm_px / strength_px) ** 2
+    smooth = (np.eye(ny * nx) + SMOOTHNESS**2 * bent) * (norm_px / strength_px) ** 2
     steps = np.diff(np.eye(ng), axis=0)
-    steady = np.eye(ng) + _STEADINESS**2 * steps.T @ steps
-    overlaps = field.overlaps() * (norm_px / _OVERLAP_PX)
+    steady = np.eye(ng) + STEADINESS**2 * steps.T @ steps
+    overlaps = field.overlaps() * (norm_px / OVERLAP_PX)
     # The two components are the last axis of the coefficients.
     whole = np.kron(steady, np.kron(smooth, np.eye(2)))
     whole += np.kron(np.eye(ng), overlaps.T @ overlaps)
@@ -366,18 +349,18 @@ def _prior(field: ResidualField, strength_px: float, norm_px: float) -> Array:
 
 def held_prior(field: ResidualField, norm_px: float) -> Array:
     """Return the prior precision that holds a field at zero."""
-    return _prior(field, _NO_STRENGTH_PX, norm_px)
+    return _prior(field, NO_STRENGTH_PX, norm_px)
 
 
 def _folds(system: FieldSystem) -> list[Mask]:
     """Return masks of the members that are left out together."""
     candidates = np.ones(len(system.group), dtype=bool)
-    if len(system.designs) >= ENOUGH_MAGNIFICATIONS:
+    if len(system.designs) >= MAGNIFICATIONS_MIN:
         # The calibration does not claim to hold beyond the outermost magnifications: they are not
         # left out.
         candidates[[0, -1]] = False
     order = np.cumsum(candidates) - 1
-    folds = min(_MAX_FOLDS, int(candidates.sum()))
+    folds = min(FOLDS_MAX, int(candidates.sum()))
     return [candidates & (order % folds == k) for k in range(folds)]
 
 
@@ -394,25 +377,25 @@ def choose_field(
         costs = [system.costs(system.solve(~fold, prior))[fold] for fold in folds]
         return np.concatenate(costs)
 
-    without = held_out(_NO_STRENGTH_PX)
+    without = held_out(NO_STRENGTH_PX)
     relative = setup.image_size[0] / REFERENCE_WIDTH_PX
-    gains = {s: without - held_out(s) for s in (relative * s for s in _STRENGTHS_PX)}
+    gains = {s: without - held_out(s) for s in (relative * s for s in STRENGTHS_PX)}
     best = max(gains, key=lambda s: float(gains[s].sum()))
     gain = float(gains[best].sum())
     # A misfit d, whitened, that the field removes from residuals r of unit variance gains r d - d^2 / 2 in each of
     # them: d^2 / 2 on average, with the variance d^2.
     sigma = float(np.sqrt(2.0 * max(gain, 0.0)))
-    most = np.mean(gains[best] > 0.0) >= _MOST_MEMBERS
+    most = np.mean(gains[best] > 0.0) >= GAINING_PART
     prior = _prior(blank, best, setup.norm_px)
     judged = np.any(folds, axis=0)
     excess = float(np.sum(system.excess[judged]))
     # A displacement of so many sigmas in each coordinate gains half its square.
-    least = 0.5 * _LEAST_SIGMAS**2 * float(np.sum(system.observations[judged]))
+    least = 0.5 * FIELD_SIZE_MIN**2 * float(np.sum(system.observations[judged]))
     return FieldChoice(
         strength_px=best,
         gain=gain,
         gain_sigma=sigma,
-        worthwhile=bool(most and gain > max(_LEAST_GAIN, _CLEARLY * sigma, least)),
+        worthwhile=bool(most and gain > max(FIELD_GAIN_SIGMAS * sigma, least)),
         explained=gain / excess if excess > 0.0 else np.inf,
         prior=prior,
     )

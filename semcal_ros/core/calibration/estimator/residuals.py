@@ -39,6 +39,7 @@ from semcal_ros.core.calibration.estimator.blocks import (
     Problem,
     State,
 )
+from semcal_ros.core.calibration.estimator.thresholds import HUBER_SIGMAS, LOSS_LOST
 from semcal_ros.core.calibration.stage import OFFSET_NAMES, attitude_residuals, height_of_tilt
 from semcal_ros.core.camera.projection import (
     ProjectionJacobians,
@@ -59,12 +60,6 @@ __all__ = [
     "whiten",
     "whitened_norm",
 ]
-
-# Huber's threshold on the norm of a whitened 2-D residual: 99 % of Gaussian corners stay quadratic.
-_HUBER = 3.0
-# Loss of a corner that the camera does not show at all: that of one that is far outside the image. An adjustment may
-# start in such a state, and leaves it as soon as it can; one that ends in it is refused.
-_LOST = 1e6
 
 
 @dataclass(frozen=True)
@@ -233,10 +228,10 @@ def _huber(norm: Array) -> tuple[Array, Array]:
     """
     seen = np.isfinite(norm)
     norm = np.where(seen, norm, 0.0)
-    outside = norm > _HUBER
-    loss = np.where(outside, _HUBER * (norm - 0.5 * _HUBER), 0.5 * norm * norm)
-    weight = np.where(outside, _HUBER / np.maximum(norm, _HUBER), 1.0)
-    return np.where(seen, loss, _LOST), np.where(seen, weight, 0.0)
+    outside = norm > HUBER_SIGMAS
+    loss = np.where(outside, HUBER_SIGMAS * (norm - 0.5 * HUBER_SIGMAS), 0.5 * norm * norm)
+    weight = np.where(outside, HUBER_SIGMAS / np.maximum(norm, HUBER_SIGMAS), 1.0)
+    return np.where(seen, loss, LOSS_LOST), np.where(seen, weight, 0.0)
 
 
 def view_costs(problem: Problem, state: State) -> Array:

@@ -29,16 +29,16 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-__all__ = ["FIRST_DAMPING", "MIN_DAMPING", "Descent", "DescentStatus", "Step", "descend"]
+from semcal_ros.core.calibration.estimator.thresholds import (
+    DAMPING_MAX,
+    DAMPING_MIN,
+    FIRST_DAMPING,
+    PREDICTED_MAX,
+)
+
+__all__ = ["Descent", "DescentStatus", "Step", "descend"]
 
 S = TypeVar("S")
-
-FIRST_DAMPING, MIN_DAMPING = 1e-5, 1e-12
-"""Damping relative to the diagonal: at the start it is nearly a Gauss-Newton step, and at the least it is one."""
-# With this damping a step has no length left.
-_MAX_DAMPING = 1e10
-# How many tolerances the quadratic model may still predict at the end: where it fails, its prediction says little.
-_PREDICTED = 1e3
 
 
 class DescentStatus(Enum):
@@ -111,7 +111,7 @@ def descend(
     for iteration in range(1, max_iterations + 1):
         solve = linearise(state)
         step = solve(damping)
-        while (step is None or not step.cost <= cost) and damping < _MAX_DAMPING:
+        while (step is None or not step.cost <= cost) and damping < DAMPING_MAX:
             damping *= 10.0
             step = solve(damping)
         if step is None:
@@ -119,10 +119,10 @@ def descend(
         if not step.cost <= cost:
             return Descent(state, cost, iteration, DescentStatus.NO_DESCENT, relative)
         decrease, cost, state = cost - step.cost, step.cost, step.state
-        damping = max(0.1 * damping, MIN_DAMPING)
+        damping = max(0.1 * damping, DAMPING_MIN)
         relative = decrease / max(cost, np.finfo(np.float64).tiny)
         small = decrease <= tolerance * cost
-        little = _PREDICTED * tolerance * (1.0 + cost) if predicted is None else predicted
+        little = PREDICTED_MAX * tolerance * (1.0 + cost) if predicted is None else predicted
         if small and step.predicted <= little:
             return Descent(state, cost, iteration, DescentStatus.SMALL_DECREASE, relative)
     return Descent(state, cost, max_iterations, DescentStatus.ITERATION_LIMIT, relative)

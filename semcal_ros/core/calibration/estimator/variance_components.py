@@ -41,21 +41,17 @@ from semcal_ros.core.calibration.estimator.problem import (
     initial_components,
     usual_lattice_sigmas,
 )
+from semcal_ros.core.calibration.estimator.thresholds import (
+    FLAT_RAD,
+    SPREAD_COUNT_MIN,
+    SPREAD_MAX,
+    SPREAD_MEMORY,
+    SPREAD_MIN,
+    SPREAD_STEP_MAX,
+    USUAL_WEIGHT,
+)
 
 __all__ = ["accelerate_components", "largest_change", "limit_components", "update_components"]
-
-# Tilt up to which a view counts as one from above: more than that of an untilted specimen on its
-# mount, less than tilts that are set on purpose.
-_FLAT_RAD = np.radians(5.0)
-# Fewer views than this do not determine a spread of their own.
-_ENOUGH_HEIGHTS = 4
-# Weight of the usual spread against one observed effect: enough to decide where nothing is observed.
-_WEIGHT_OF_USUAL = 0.05
-# Updates from which the next one is extrapolated, and the largest extrapolation of the logarithm of a spread: from
-# farther away the updates are not linear.
-_MEMORY, _FARTHEST = 4, 0.5
-# Limits of a spread, relative to its usual value. Below the lower one, no view can show it.
-_LEAST, _MOST = 0.01, 20.0
 
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
@@ -64,10 +60,10 @@ def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Sp
     determined = float(np.sum(known_part))
     # The information of the data on an effect is (1 / variance - 1) / sigma^2.
     visible = float(np.sum(known_part / (known_part + variance * (sigma / usual) ** 2)))
-    known = _WEIGHT_OF_USUAL
+    known = USUAL_WEIGHT
     square = (sigma**2 * float(np.sum(residuals**2)) + known * usual**2) / (determined + known)
     return Spread(
-        float(np.clip(np.sqrt(square), _LEAST * usual, _MOST * usual)), determined, visible
+        float(np.clip(np.sqrt(square), SPREAD_MIN * usual, SPREAD_MAX * usual)), determined, visible
     )
 
 
@@ -114,12 +110,14 @@ def accelerate_components(
     Anderson's extrapolation (1965, doi:10.1145/321296.321305) of the logarithms of the spreads: the updates alone gain
     a digit in five.
     """
-    before, after = (np.stack([_log_sigmas(u[k]) for u in updates[-_MEMORY:]]) for k in (0, 1))
+    before, after = (
+        np.stack([_log_sigmas(u[k]) for u in updates[-SPREAD_MEMORY:]]) for k in (0, 1)
+    )
     moved = after - before
     if len(moved) > 1:
         weights = np.linalg.lstsq(np.diff(moved, axis=0).T, moved[-1], rcond=None)[0]
         step = np.diff(after, axis=0).T @ weights
-        if np.max(np.abs(step)) < _FARTHEST:
+        if np.max(np.abs(step)) < SPREAD_STEP_MAX:
             return _with_log_sigmas(updates[-1][1], after[-1] - step)
     return updates[-1][1]
 
@@ -151,8 +149,8 @@ def _with_log_sigmas(components: VarianceComponents, logarithms: Array) -> Varia
 
 def _updated_components(setup: Setup, problem: Problem, result: BundleResult) -> VarianceComponents:
     priors = setup.priors
-    flat: Mask = result.state.rotations[:, 2, 2] > np.cos(_FLAT_RAD)
-    if min(flat.sum(), (~flat).sum()) < _ENOUGH_HEIGHTS:
+    flat: Mask = result.state.rotations[:, 2, 2] > np.cos(FLAT_RAD)
+    if min(flat.sum(), (~flat).sum()) < SPREAD_COUNT_MIN:
         flat = np.zeros_like(flat)
     height = problem.height_sigma_m.copy()
     for own in (flat, ~flat):
@@ -162,7 +160,7 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
             residuals = result.prior_residuals["height"][own, 0] * sigma / sigma[0]
             variance = result.prior_variance["height"][own, 0]
             height[own] = _update(float(sigma[0]), priors.height_sigma_m, residuals, variance).sigma
-    if len(height) < _ENOUGH_HEIGHTS or problem.across is not None:
+    if len(height) < SPREAD_COUNT_MIN or problem.across is not None:
         # Otherwise a height would widen its own prior, and a camera could run away with it: of lines, those in two
         # directions can be at two heights as well as under an aspect ratio.
         height = np.minimum(height, priors.height_sigma_m)
@@ -227,7 +225,7 @@ def _drift_sigma(problem: Problem, result: BundleResult, usual: float) -> Array:
     square = np.sum(drift**2, axis=1)
     # The weights are those of chi-squares of the spread before, with as many degrees of freedom as
     # are determined; the last row is the usual one.
-    root, known = np.sqrt(np.maximum(determined, 1e-6)), np.sqrt(_WEIGHT_OF_USUAL)
+    root, known = np.sqrt(np.maximum(determined, 1e-6)), np.sqrt(USUAL_WEIGHT)
     rows = np.vstack([design * (root / sigma**2)[:, None], [known * usual**-2.0, 0.0]])
     found, _ = nnls(rows, np.append(square / (root * sigma**2), known))
-    return np.sqrt(np.clip(design @ found, (_LEAST * usual) ** 2, (_MOST * usual) ** 2))
+    return np.sqrt(np.clip(design @ found, (SPREAD_MIN * usual) ** 2, (SPREAD_MAX * usual) ** 2))

@@ -42,6 +42,14 @@ from semcal_ros.core.calibration.judgement.revision import (
     make_setup,
     revise,
 )
+from semcal_ros.core.calibration.judgement.thresholds import (
+    CELL_VIEWS_MIN,
+    CHECK_CELLS,
+    CHECK_FALSE_ALARMS,
+    MISFIT_SIGMA,
+    OTHER_SCALE,
+    SIGN_FLIPS,
+)
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
@@ -57,20 +65,7 @@ CHANGES = {
     "distortion": ("xi_r", "xi_t"),
     "centre of distortion": ("ex", "ey"),
 }
-# A valid calibration is called degraded in one check of a hundred: each of the tests has its share.
-_FALSE_ALARMS = 0.01
 _TESTS = len(CHANGES) + 1
-# Turns of signs: a hundred times the reciprocal of the least probability that matters.
-_FLIPS = 20_000
-# Cells per side in which the mean residual is tested: as fine as the knots of a residual field.
-_CELLS = 6
-# Least number of views in which a cell is seen; fewer do not tell a pattern from the scatter of the views.
-_ENOUGH_VIEWS = 6
-# How well the uncertainty of the corners is known (benchmarks, "Corner finding"), relative.
-_MISFIT_SIGMA = 0.1
-# A scale that is off by more than this is another microscope, display width or grid: repeatability and ageing
-# of an SEM are below 1 % (ISO 16700 asks for better than 10 % of the maker's magnification).
-_OTHER_SCALE = 0.1
 
 
 class Verdict(Enum):
@@ -138,7 +133,7 @@ class ShapeTest:
     @property
     def significant(self) -> bool:
         """Whether there is a pattern, and a stronger one than the calibration allows for."""
-        return self.p_value < _FALSE_ALARMS / _TESTS and self.rms_px > self.stated_px
+        return self.p_value < CHECK_FALSE_ALARMS / _TESTS and self.rms_px > self.stated_px
 
 
 @dataclass(frozen=True)
@@ -183,7 +178,7 @@ class CalibrationCheck:
 
         A large one is no change of the camera but noise, blur or an uneven grid, and takes no part in the verdict.
         """
-        return (self.misfit - 1.0) / _MISFIT_SIGMA
+        return (self.misfit - 1.0) / MISFIT_SIGMA
 
     @property
     def summary(self) -> str:
@@ -242,7 +237,7 @@ def check_calibration(
     changes, scale = tuple(by_name[name] for name in proven), by_name["scale"]
     shape = _test_shape(setup, problem, result, _stated_px(model, setup))
     verdict = Verdict.DEGRADED if changes or shape.significant else Verdict.VALID
-    if changes and abs(scale.values[0]) > _OTHER_SCALE:
+    if changes and abs(scale.values[0]) > OTHER_SCALE:
         verdict = Verdict.INVALID
     return CalibrationCheck(
         verdict,
@@ -332,7 +327,7 @@ def _select(estimate: _Estimate) -> list[Change]:
         given = [p for name in chosen for p in CHANGES[name]]
         rest = [_test(estimate, given, name) for name in CHANGES if name not in chosen]
         best = min(rest, key=lambda change: change.p_value)
-        if best.p_value >= _FALSE_ALARMS / _TESTS:
+        if best.p_value >= CHECK_FALSE_ALARMS / _TESTS:
             break
         chosen.append(best.name)
     # What a later choice explains better is taken back.
@@ -342,7 +337,7 @@ def _select(estimate: _Estimate) -> list[Change]:
             for name in chosen
         }
         found = [_test(estimate, others[name], name) for name in chosen]
-        needless = [change for change in found if change.p_value >= _FALSE_ALARMS / _TESTS]
+        needless = [change for change in found if change.p_value >= CHECK_FALSE_ALARMS / _TESTS]
         if not needless:
             return sorted(found, key=lambda change: change.p_value)
         chosen.remove(max(needless, key=lambda change: change.p_value).name)
@@ -357,9 +352,11 @@ def _test_shape(
     one view have in common.
     """
     width, height = setup.image_size
-    cell = np.minimum((problem.observed_px / (width, height) * _CELLS).astype(int), _CELLS - 1)
-    index = cell[:, 1] * _CELLS + cell[:, 0]
-    views, cells = len(setup.views), _CELLS**2
+    cell = np.minimum(
+        (problem.observed_px / (width, height) * CHECK_CELLS).astype(int), CHECK_CELLS - 1
+    )
+    index = cell[:, 1] * CHECK_CELLS + cell[:, 0]
+    views, cells = len(setup.views), CHECK_CELLS**2
     inlier = result.huber_weight >= 1.0
     place = problem.view_of_point * cells + index
     count = np.bincount(place[inlier], minlength=views * cells).reshape(views, cells)
@@ -370,7 +367,7 @@ def _test_shape(
         )
         means[:, :, axis] = sums.reshape(views, cells) / np.maximum(count, 1)
     seen = count > 0
-    enough = seen.sum(axis=0) >= _ENOUGH_VIEWS
+    enough = seen.sum(axis=0) >= CELL_VIEWS_MIN
     if not np.any(enough):
         return ShapeTest(0.0, np.nan, stated_px)
     means, seen = means[:, enough], seen[:, enough]
@@ -382,13 +379,13 @@ def _test_shape(
         return np.sum(mean**2 / np.maximum(square, 1e-12) * number, axis=(1, 2))
 
     rng = np.random.default_rng(0)
-    flips = rng.choice([-1.0, 1.0], size=(_FLIPS, views))
+    flips = rng.choice([-1.0, 1.0], size=(SIGN_FLIPS, views))
     observed = float(statistic(np.ones((1, views)))[0])
     beyond = int(np.sum(statistic(flips) >= observed))
     noise = (square - np.mean(means, axis=0) ** 2) / np.maximum(number - 1, 1)
     pattern = (np.sum(means, axis=0) / number) ** 2 - np.maximum(noise, 0.0)
     rms = float(np.sqrt(max(np.mean(pattern), 0.0)))
-    return ShapeTest(rms, (beyond + 1) / (_FLIPS + 1), stated_px)
+    return ShapeTest(rms, (beyond + 1) / (SIGN_FLIPS + 1), stated_px)
 
 
 def _with_effect(model: CalibrationModel, setup: Setup, change: Change) -> Change:

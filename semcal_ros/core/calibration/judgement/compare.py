@@ -28,20 +28,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.judgement.thresholds import (
+    COMPARED_ACROSS,
+    COMPARED_COUNT,
+    DIFFERENT_SIGMAS,
+)
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
 __all__ = ["CalibrationDifference", "DifferenceAt", "compare_calibrations"]
-
-# Magnifications that are compared where none are given: three per factor of ten over two decades.
-_COMPARED = 7
-# Pixels across the field.
-_ACROSS = 13
-# Beyond so many joint sigmas two calibrations differ. Over the range and the field, some ten independent numbers are
-# looked at: one of them is beyond 3.3 by chance in one of a hundred comparisons.
-_SIGMAS = 3.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +120,7 @@ class CalibrationDifference:
     @property
     def agree(self) -> bool:
         """Whether nothing differs by more than chance explains."""
-        return self.largest_sigmas <= _SIGMAS
+        return self.largest_sigmas <= DIFFERENT_SIGMAS
 
 
 def compare_calibrations(
@@ -164,7 +161,9 @@ def compare_calibrations(
     chosen = sorted(float(g) for g in magnifications)
     if not chosen:
         chosen = (
-            [low] if high <= low * (1.0 + 1e-9) else np.geomspace(low, high, _COMPARED).tolist()
+            [low]
+            if high <= low * (1.0 + 1e-9)
+            else np.geomspace(low, high, COMPARED_COUNT).tolist()
         )
     outside = [g for g in chosen if not low * (1.0 - 1e-9) <= g <= high * (1.0 + 1e-9)]
     if outside:
@@ -183,7 +182,7 @@ def compare_calibrations(
 
 
 def _compare_at(first: ScanCamera, second: ScanCamera) -> DifferenceAt:
-    xy = make_field_lattice(first.width, first.height, _ACROSS)
+    xy = make_field_lattice(first.width, first.height, COMPARED_ACROSS)
     middle = 0.5 * np.array([[first.width - 1.0, first.height - 1.0]])
     ideal = first.undistort(np.concatenate([middle, xy]))
     known = np.all(np.isfinite(ideal), axis=1)

@@ -29,7 +29,9 @@ from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Indices
 from semcal_ros.core.calibration.estimator.blocks import Problem, State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.estimator.poses import pose_from_camera
-from semcal_ros.core.calibration.estimator.problem import HELD_SIGMA, Priors
+from semcal_ros.core.calibration.estimator.problem import Priors
+from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
+from semcal_ros.core.calibration.judgement.thresholds import FREE_CHANGE, POSE_STEPS_MAX
 from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.core.camera.projection import ALL_NAMES
@@ -37,9 +39,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
 __all__ = ["ScaleError", "ViewPose", "compare_scales", "fit_poses", "rms_by_magnification"]
-
-# Prior 1-sigma of the relative scale of the images about the calibration's: no limit in practice.
-_FREE_SCALE = 0.1
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def compare_scales(
         raster=cameras[0].raster,
         nominal_px_per_m=np.array([c.m for c in cameras]),
         prior_mean=np.append(1.0, np.zeros(count)),
-        prior_sigma=np.append(HELD_SIGMA, np.full(count, _FREE_SCALE)),
+        prior_sigma=np.append(HELD_SIGMA, np.full(count, FREE_CHANGE)),
         height_sigma_m=height_sigma_m,
     )
     problem = _hold_lines_flat(problem)
@@ -170,10 +169,6 @@ def _hold_lines_flat(problem: Problem) -> Problem:
     count = len(problem.group)
     flat = attitudes([None] * count, [True] * count, StageAxis(), Priors().untilted_sigma_rad)
     return replace(problem, attitudes=flat)
-
-
-# The tilt of a nearly flat view acts through its square, so its last degrees take many small steps.
-_POSE_ITERATIONS = 300
 
 
 def fit_poses(
@@ -215,7 +210,7 @@ def fit_poses(
     else:
         rotations, translations = starts[0][None], starts[1][None]
     fits = [
-        refine(problem, State(np.ones(1), r, t), fixed_theta=True, max_iterations=_POSE_ITERATIONS)
+        refine(problem, State(np.ones(1), r, t), fixed_theta=True, max_iterations=POSE_STEPS_MAX)
         for r, t in zip(rotations, translations, strict=True)
     ]
     usable = [f for f in fits if np.isfinite(f.cost)]

@@ -23,9 +23,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.arrays import Array, Indices, mad_sigma
+from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD, NAMED_MAX
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
+from semcal_ros.core.calibration.judgement.thresholds import (
+    CELL_CORNERS_MIN,
+    COVERAGE_CELLS,
+    EMPTY_PART,
+    FILLED_PART,
+    HELD_OUT_RATIO,
+    NEXT_SIGMA_PX,
+    PATTERN_PX,
+    PATTERN_RATIO,
+    REJECTED_PART,
+    VIEW_RATIO,
+)
 from semcal_ros.core.calibration.method_fit import Finding, rank_findings
 from semcal_ros.core.calibration.views import FoundView, RejectedView, show_lines
 from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
@@ -48,10 +61,6 @@ __all__ = [
     "measure_view_coverage",
     "normalise_residuals",
 ]
-
-# Cells across the field. At the lowest magnifications a square of the grid is smaller than one of them; at the
-# highest, a view has some tens of corners, and a few views fill them.
-_ACROSS = 8
 
 
 @dataclass(frozen=True)
@@ -88,9 +97,9 @@ def estimate_tilt_deg(detection: LatticeDetection) -> float:
 
 def _filled(detection: LatticeDetection, rows: int) -> Array:
     width, height = detection.image_size
-    cells = np.floor((detection.xy + 0.5) / np.array([width / _ACROSS, height / rows]))
-    column, row = np.clip(cells.astype(np.intp), 0, [_ACROSS - 1, rows - 1]).T
-    filled = np.zeros((rows, _ACROSS), dtype=np.float64)
+    cells = np.floor((detection.xy + 0.5) / np.array([width / COVERAGE_CELLS, height / rows]))
+    column, row = np.clip(cells.astype(np.intp), 0, [COVERAGE_CELLS - 1, rows - 1]).T
+    filled = np.zeros((rows, COVERAGE_CELLS), dtype=np.float64)
     filled[row, column] = 1.0
     return filled
 
@@ -106,7 +115,7 @@ def measure_view_coverage(views: Sequence[FoundView]) -> ViewCoverage:
     if not views:
         return ViewCoverage(0.0, (), {})
     width, height = views[0].detection.image_size
-    rows = max(1, round(_ACROSS * height / width))
+    rows = max(1, round(COVERAGE_CELLS * height / width))
     filled = np.max([_filled(view.detection, rows) for view in views], axis=0)
     tilts = []
     for view in views:
@@ -176,13 +185,6 @@ def compute_tilts_deg(result: CalibrationResult) -> tuple[Array, Array]:
     return tilt, np.degrees(np.arctan2(upright[:, 1], upright[:, 0]))
 
 
-# Cells across the field for the test: larger than in the figure, so that their means are less
-# noisy.
-_PATTERN_CELLS = 8
-# With fewer corners a cell is left out.
-_MIN_IN_CELL = 5
-
-
 def normalise_residuals(result: CalibrationResult) -> Array:
     """Divide residuals (n, 2), or (n, 1) across the lines of a grating, by the 1-sigma of their corners."""
     own = zip(result.views, result.fit.residuals_px, strict=True)
@@ -197,17 +199,16 @@ def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     """
     xy, residuals = concatenate_corners(result)
     weights = np.concatenate([v.sigma_px for v in result.views]) ** -2.0
-    cells = assign_cells(result, xy, _PATTERN_CELLS)
+    cells = assign_cells(result, xy, COVERAGE_CELLS)
     size = cells.columns * cells.rows
-    enough = cells.counts >= _MIN_IN_CELL
+    enough = cells.counts >= CELL_CORNERS_MIN
     if not np.any(enough):
         return 0.0, 1.0
     total = np.bincount(cells.index, weights, size)[enough]
     sums = np.stack(
         [np.bincount(cells.index, weights * residuals[:, k], size)[enough] for k in (0, 1)], axis=1
     )
-    # The median is robust; 0.6745 is the median absolute value of a standard normal variable.
-    spread = float(np.median(np.abs(normalise_residuals(result)))) / 0.6745
+    spread = mad_sigma(normalise_residuals(result))
     chance = spread**2 / total
     squares = np.sum((sums / total[:, None]) ** 2, axis=1)
     expected = result.views[0].dimensions * chance
@@ -215,30 +216,6 @@ def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     if not np.all(chance > 0.0):
         return 0.0, 1.0
     return float(np.sqrt(max(excess, 0.0))), float(np.mean(squares / expected))
-
-
-# Part of the field without a corner that is worth a warning: about 5 of 108 cells of a 4:3 image.
-_EMPTY_SHARE = 0.05
-# This tilt shortens the grid by 0.4 % only, which shows little of the perspective.
-_SMALL_TILT_DEG = 5.0
-# Predicting a magnification from the others is a little worse than fitting it; this much worse
-# means that the functions between the magnifications miss something.
-_HELD_OUT_RATIO = 1.5
-# Part of the field that the corners of one magnification should reach.
-_FILLED_SHARE = 0.5
-# More rejected views than this are no accident: something is wrong with the recording.
-_REJECTED_SHARE = 1.0 / 3.0
-# RMS error of a view over its prediction from the corners' 1-sigma, above which it is named.
-_VIEW_RATIO = 3.0
-# Mean square of the cells' mean residuals over that expected by chance, above which they form a
-# pattern.
-_PATTERN_RATIO = 3.0
-# RMS of a pattern, px: a smaller one may be significant but does not matter.
-_PATTERN_PX = 0.02
-# Beyond this predicted error, between two calibrated magnifications or at one, more images help.
-_SIGMA_PX = 2.0
-# Views or magnifications that a sentence names; the others are counted.
-_NAMED = 5
 
 
 def find_all(
@@ -270,14 +247,14 @@ def find_weaknesses(
 
 
 def _join_names(items: Sequence[str]) -> str:
-    more = len(items) - _NAMED
-    return ", ".join(items[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(items) - NAMED_MAX
+    return ", ".join(items[:NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
 def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) -> list[Finding]:
     found = []
     total = len(rejected) + len(result.views)
-    if len(rejected) > _REJECTED_SHARE * total:
+    if len(rejected) > REJECTED_PART * total:
         reason, count = Counter(r.reason for r in rejected).most_common(1)[0]
         found.append(
             Finding(
@@ -289,7 +266,7 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
     for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
         rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
         ratio = rms / view.expected_rms_px
-        if ratio > _VIEW_RATIO:
+        if ratio > VIEW_RATIO:
             bad.append((ratio, rms, view))
     if bad:
         bad.sort(key=lambda item: -item[0])
@@ -297,7 +274,7 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
         names = _join_names([f"{view.name} ({view.magnification:g}x)" for _, _, view in bad])
         found.append(
             Finding(
-                f"the corners of {names} fit more than {_VIEW_RATIO:g} times worse than their own uncertainty: "
+                f"the corners of {names} fit more than {VIEW_RATIO:g} times worse than their own uncertainty: "
                 "look at these images, and leave them out if something is wrong",
                 worst_px,
                 magnification=float(worst.magnification),
@@ -309,7 +286,7 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
 def _check_field(result: CalibrationResult) -> list[Finding]:
     found = []
     empty = compute_empty_share(result)
-    if empty > _EMPTY_SHARE:
+    if empty > EMPTY_PART:
         found.append(
             Finding(
                 f"{100.0 * empty:.0f} % of the image field has no corner in any view: "
@@ -317,7 +294,7 @@ def _check_field(result: CalibrationResult) -> list[Finding]:
             )
         )
     shares = compute_reached_shares(result)
-    poor = [f"{g:g}x" for g, share in shares.items() if share < _FILLED_SHARE]
+    poor = [f"{g:g}x" for g, share in shares.items() if share < FILLED_PART]
     # If all of them are poor, the sentence above says so, or the grid is very coarse.
     if 0 < len(poor) < len(shares):
         found.append(
@@ -327,7 +304,7 @@ def _check_field(result: CalibrationResult) -> list[Finding]:
             )
         )
     largest = float(np.max(compute_tilts_deg(result)[0]))
-    if largest < _SMALL_TILT_DEG and not show_lines(result.views):
+    if largest < math.degrees(FLAT_RAD) and not show_lines(result.views):
         found.append(
             Finding(
                 f"no view is tilted by more than {largest:.1f} degrees: scale and height are hardly "
@@ -347,7 +324,7 @@ def _check_held_out(result: CalibrationResult) -> list[Finding]:
     fitted = rms_by_magnification(result.fit)
     # The two outermost magnifications are extrapolated in this test, unlike in any proper use.
     inner = [g for g in result.model.magnifications[1:-1] if g in values]
-    worse = [g for g in inner if values[g] > _HELD_OUT_RATIO * fitted[g]]
+    worse = [g for g in inner if values[g] > HELD_OUT_RATIO * fitted[g]]
     if not worse:
         return []
     worst = max(worse, key=lambda g: values[g])
@@ -363,7 +340,7 @@ def _check_held_out(result: CalibrationResult) -> list[Finding]:
 
 def _check_pattern(result: CalibrationResult) -> list[Finding]:
     size, ratio = estimate_pattern_px(result)
-    if ratio > _PATTERN_RATIO and size > _PATTERN_PX:
+    if ratio > PATTERN_RATIO and size > PATTERN_PX:
         low, high = result.model.magnification_range
         return [
             Finding(
@@ -389,7 +366,7 @@ def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
     except (InvalidValueError, ValueError):
         return []
     g = max(worst, key=lambda x: worst[x])
-    if worst[g] > _SIGMA_PX:
+    if worst[g] > NEXT_SIGMA_PX:
         return [
             Finding(
                 f"around {float(f'{g:.2g}'):.10g}x positions at the edge of the image are uncertain "

@@ -38,6 +38,18 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import whitened_norm
+from semcal_ros.core.calibration.judgement.thresholds import (
+    DETERMINED_MIN,
+    HEIGHT_SIGMAS,
+    HEIGHT_SPREAD_MIN_M,
+    JUMP_SIGMAS,
+    MISFIT_RATIO,
+    SHAPE_SPREAD_MIN,
+    TILT_SIGMAS,
+    VIEWS_MIN,
+    WRONG_PART_MAX,
+    WRONG_QUANTILE_SIGMAS,
+)
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
 
@@ -49,11 +61,6 @@ __all__ = [
     "find_wrong_tilts",
     "measure_deviations",
 ]
-
-
-# Standard deviations: a recording without a jump is suspected in one of twenty cases, as there are
-# many places where it could be.
-_JUMP_SIGMAS = 2.7
 
 
 @dataclass(frozen=True)
@@ -102,8 +109,8 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     variance = max(variance_factor(problem, result), 1.0)
     # Scatter of few visits is known badly: by Student's t, the same chance needs a larger gain.
     freedom = max(determined - 1.0, 1.0)
-    chance = ndtr(-_JUMP_SIGMAS)
-    by_corners, by_visits = (0.5 * x**2 for x in (_JUMP_SIGMAS, stdtrit(freedom, chance)))
+    chance = ndtr(-JUMP_SIGMAS)
+    by_corners, by_visits = (0.5 * x**2 for x in (JUMP_SIGMAS, stdtrit(freedom, chance)))
     best, best_excess = None, 1.0
     for k in range(1, len(g)):
         if any(g[k - 1] < b <= g[k] for b in setup.breakpoints):
@@ -126,12 +133,6 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     return best
 
 
-# Deviation of a tilt from what the stage says, in sigmas, beyond which one of them is wrong.
-_TILT_SIGMAS = 5.0
-# A residual that the view itself hardly determines says nothing.
-_LEAST_DETERMINED = 0.02
-
-
 def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, float]:
     """Find the views whose tilt contradicts the stage; index and contradiction in sigmas of each.
 
@@ -141,26 +142,10 @@ def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, flo
     if problem.attitudes is None:
         return {}
     left = result.prior_residuals["attitude"]
-    free = np.maximum(1.0 - result.prior_variance["attitude"], _LEAST_DETERMINED)
+    free = np.maximum(1.0 - result.prior_variance["attitude"], DETERMINED_MIN)
     deviation = np.max(np.abs(left) / np.sqrt(free), axis=1)
-    limit = max(_TILT_SIGMAS, 0.5 * float(deviation.max()))
+    limit = max(TILT_SIGMAS, 0.5 * float(deviation.max()))
     return {int(v): float(deviation[v]) for v in np.flatnonzero(deviation > limit)}
-
-
-# Largest deviation of height and stretch in robust standard deviations: heights are a mixture of views
-# with still and with moved stages, with long tails.
-_LARGEST_SIGMAS = 8.0
-# Least spread of the heights, m; smaller differences of height are not significant.
-_LEAST_HEIGHT_M = 5e-6
-# Least spread of the stretches and shears; smaller differences are those of ordinary grids.
-_LEAST_SHAPE = 5e-4
-# RMS residual of a view over that of the median view. Good views differ by less, and a wrong
-# magnification that the height cannot imitate exceeds it. Chosen by trial.
-_MISFIT_RATIO = 6.0
-# Where a magnification has fewer views, they are compared with those at all magnifications.
-_ENOUGH_VIEWS = 3
-# Largest part of the views that may disagree: single views are wrong, not many.
-_FEW = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,16 +190,21 @@ def measure_deviations(problem: Problem, result: BundleResult) -> Deviations:
     misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
     offset = height - np.median(height)
     for own in _members(problem):
-        if len(own) >= _ENOUGH_VIEWS:
+        if len(own) >= VIEWS_MIN:
             offset[own] = height[own] - np.median(height[own])
-    # 90 % of normal deviates are below 1.645; the median would only reflect the views with a still
-    # stage.
-    spread = max(float(np.quantile(np.abs(offset), 1.0 - _FEW)) / 1.645, _LEAST_HEIGHT_M)
+    # The median would only reflect the views with a still stage.
+    spread = max(
+        float(np.quantile(np.abs(offset), 1.0 - WRONG_PART_MAX)) / WRONG_QUANTILE_SIGMAS,
+        HEIGHT_SPREAD_MIN_M,
+    )
     sigmas = np.abs(offset) / spread
     stretch = np.zeros(len(height))
     if len(result.state.lattices):
         stretch = np.max(np.abs(result.state.lattices), axis=1)
-        usual = max(float(np.quantile(stretch, 1.0 - _FEW)) / 1.645, _LEAST_SHAPE)
+        usual = max(
+            float(np.quantile(stretch, 1.0 - WRONG_PART_MAX)) / WRONG_QUANTILE_SIGMAS,
+            SHAPE_SPREAD_MIN,
+        )
         sigmas = np.hypot(sigmas, stretch / usual)
     return Deviations(offset, stretch, misfit, spread, sigmas)
 
@@ -231,12 +221,12 @@ def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Reject
     disagree, or many in all, the fault is not in single views, and none is returned.
     """
     found = measure_deviations(problem, result)
-    odd = (found.sigmas > _LARGEST_SIGMAS) | (found.misfit > _MISFIT_RATIO)
+    odd = (found.sigmas > HEIGHT_SIGMAS) | (found.misfit > MISFIT_RATIO)
     outliers: dict[int, Rejection[ViewStatus]] = {}
-    if odd.mean() > _FEW:
+    if odd.mean() > WRONG_PART_MAX:
         return outliers
     for own in _members(problem):
-        if len(own) >= _ENOUGH_VIEWS and 2 * odd[own].sum() >= len(own):
+        if len(own) >= VIEWS_MIN and 2 * odd[own].sum() >= len(own):
             continue
         for v in own[odd[own]]:
             outliers[int(v)] = found.reject(int(v))

@@ -32,8 +32,21 @@ import numpy as np
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.calibration.estimator.blocks import Effects, State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
-from semcal_ros.core.calibration.estimator.problem import HELD_SIGMA, REFERENCE_WIDTH_PX, Priors
+from semcal_ros.core.calibration.estimator.problem import Priors
+from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA, REFERENCE_WIDTH_PX
 from semcal_ros.core.calibration.judgement.revision import CHANGING, record_of
+from semcal_ros.core.calibration.judgement.thresholds import (
+    CANDIDATES,
+    JUDGED,
+    PLANNED_ACROSS_MAX,
+    PLANNED_DIRECTIONS_RAD,
+    PLANNED_ROTATIONS_RAD,
+    PLANNED_SIGMA_PX,
+    PLANNED_TILTS_RAD,
+    PLANNED_VISITS_MAX,
+    SQUARES_ACROSS_MIN,
+    VISIT_WORTH,
+)
 from semcal_ros.core.calibration.judgement.update import ageing_sigmas, change_directions
 from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import GridView
@@ -49,30 +62,12 @@ from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.wording import rounded_magnification
 
 __all__ = [
-    "PLANNED_DIRECTIONS_RAD",
-    "PLANNED_TILTS_RAD",
     "PlannedVisit",
     "Verdict",
     "ViewPlan",
     "judge_calibration",
     "plan_views",
 ]
-
-#: Tilts of the views of a planned visit: without tilt, and two that a stage of any SEM reaches.
-PLANNED_TILTS_RAD = (0.0, math.radians(20.0), math.radians(40.0))
-# In-plane turns of these views: different ones, so that aspect and skew are seen.
-_TURNS_RAD = (0.2, 1.3, 2.4)
-#: Directions of the lines of a grating in the views of a planned visit: the most different ones.
-PLANNED_DIRECTIONS_RAD = (0.0, math.radians(60.0), math.radians(120.0))
-# Candidates, and magnifications at which the sigma is judged.
-_CANDIDATES, _JUDGED = 15, 25
-# A plan of more visits is a new calibration.
-_MOST_VISITS = 30
-# 1-sigma of a corner per axis, px: a sharp image; what limits a calibration is the visits, not the corners.
-_CORNER_SIGMA_PX = 0.05
-# Squares across the image that a view should show, at least.
-_SQUARES_ACROSS = 8.0
-_MOST_CORNERS_ACROSS = 30
 
 
 @dataclass(frozen=True)
@@ -156,16 +151,16 @@ def plan_views(
         If a number is out of range, or there are no squares.
     """
     check_positive(target, "target =")
-    if not 1 <= most_visits <= _MOST_VISITS:
-        raise InvalidValueError(f"{most_visits} visits", expected=f"1 to {_MOST_VISITS}")
+    if not 1 <= most_visits <= PLANNED_VISITS_MAX:
+        raise InvalidValueError(f"{most_visits} visits", expected=f"1 to {PLANNED_VISITS_MAX}")
     if not squares_m or min(squares_m) <= 0.0:
         raise InvalidValueError(f"squares of {list(squares_m)} m", expected="positive sizes")
     low, high = model.magnification_range
-    judged = np.geomspace(low, high, _JUDGED) if high > low else np.array([low])
+    judged = np.geomspace(low, high, JUDGED) if high > low else np.array([low])
     if model.ladder is not None:
         # Beyond, the grid shows nothing.
         low, high = model.ladder.anchored
-    candidates = np.geomspace(low, high, _CANDIDATES) if high > low else np.array([low])
+    candidates = np.geomspace(low, high, CANDIDATES) if high > low else np.array([low])
     root = np.concatenate([_root(model), _aged(model, ageing)], axis=1)
     rows = np.stack([pixel_size_gradient(model, float(g)) @ root for g in judged])  # (G, 2, K)
     floor = np.array(
@@ -246,7 +241,7 @@ def _design(model: CalibrationModel, g: float) -> Array:
 def _square_for(camera: ScanCamera, squares_m: Sequence[float]) -> float:
     """The largest squares of which enough fit the image, else the smallest."""
     field = camera.width * camera.pixel_size_m[0]
-    fitting = [size for size in squares_m if field / size >= _SQUARES_ACROSS]
+    fitting = [size for size in squares_m if field / size >= SQUARES_ACROSS_MIN]
     return max(fitting) if fitting else min(squares_m)
 
 
@@ -257,20 +252,20 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
     heights = record_of(model, usual)
     views, rotations = [], []
     field = camera.width * camera.pixel_size_m[0]
-    count = min(int(1.5 * field / square_m) + 2, 2 * _MOST_CORNERS_ACROSS)
+    count = min(int(1.5 * field / square_m) + 2, 2 * PLANNED_ACROSS_MAX)
     # More corners than these tell no more than a finer spacing of as many would.
-    step = square_m * max(1, math.ceil(1.5 * field / square_m / (2 * _MOST_CORNERS_ACROSS)))
+    step = square_m * max(1, math.ceil(1.5 * field / square_m / (2 * PLANNED_ACROSS_MAX)))
     index = (np.arange(count) - 0.5 * (count - 1)) * step
     board = np.stack(np.meshgrid(index, index), axis=-1).reshape(-1, 2)
     of_lines = _is_of_grating(model)
     tilts = (0.0,) * len(PLANNED_DIRECTIONS_RAD) if of_lines else PLANNED_TILTS_RAD
-    turns = PLANNED_DIRECTIONS_RAD if of_lines else _TURNS_RAD
+    turns = PLANNED_DIRECTIONS_RAD if of_lines else PLANNED_ROTATIONS_RAD
     for tilt, turn in zip(tilts, turns, strict=True):
         rotation = _tilt(tilt) @ _turn(turn)
         points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T
         xy = camera.project(points)
         inside = np.all((xy >= 0.0) & (xy <= (camera.width - 1.0, camera.height - 1.0)), axis=1)
-        sigmas = np.full(int(inside.sum()), _CORNER_SIGMA_PX)
+        sigmas = np.full(int(inside.sum()), PLANNED_SIGMA_PX)
         view = GridView(g, board[inside], xy[inside], sigmas, square_m=square_m)
         if of_lines:
             along = camera.project(points + step * rotation[:, 1]) - xy
@@ -323,10 +318,6 @@ def _tilt(angle: float) -> Array:
 def _turn(angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-# A visit that lowers the largest sigma by less than this part is not worth the way to the microscope.
-_WORTH = 0.05
 
 
 @dataclass(frozen=True)
@@ -426,7 +417,7 @@ def judge_calibration(model: CalibrationModel) -> Verdict:
         else:
             floor = plan.floor
             first = plan.visits[0] if plan.visits else None
-            if first is not None and first.largest < (1.0 - _WORTH) * largest:
+            if first is not None and first.largest < (1.0 - VISIT_WORTH) * largest:
                 visit = first
     conditions = model.provenance.describe_essentials()
     return Verdict(

@@ -36,7 +36,6 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
 from semcal_ros.core.calibration.estimator.poses import adjust
 from semcal_ros.core.calibration.estimator.posterior import estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.estimator.problem import (
-    HELD_SIGMA,
     Priors,
     Setup,
     Spread,
@@ -45,8 +44,10 @@ from semcal_ros.core.calibration.estimator.problem import (
     initial_components,
     with_shared,
 )
+from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.calibration.estimator.variance_components import update_components
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
+from semcal_ros.core.calibration.judgement.thresholds import DRIFT_UPDATES, FREE_CHANGE
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices, mark_untilted
 from semcal_ros.core.calibration.views import (
@@ -77,10 +78,6 @@ __all__ = [
 #: Parameters that may have changed since the calibration, by the same amount at all magnifications; that of the
 #: scale is relative.
 CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
-# Prior 1-sigma of a scale that may have changed by anything: no limit in practice.
-_FREE_SCALE = 0.3
-# Updates of the spread of the drift within the images, which is the recording's own.
-_UPDATES = 3
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ class Revision:
 
 def free_sigmas(setup: Setup) -> dict[str, float]:
     """Prior 1-sigma of changes of any size, by name."""
-    return {name: _FREE_SCALE if name == "scale" else setup.prior_of(name)[1] for name in CHANGING}
+    return {name: FREE_CHANGE if name == "scale" else setup.prior_of(name)[1] for name in CHANGING}
 
 
 def make_setup(
@@ -273,7 +270,7 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
     result = adjust(problem, State(theta, poses.rotations, poses.translations_m))
-    for _ in range(_UPDATES if problem.effects is not None else 0):
+    for _ in range(DRIFT_UPDATES if problem.effects is not None else 0):
         own = update_components(setup, problem, result)
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
         problem = _build(model, setup, spread, sigmas)

@@ -25,6 +25,12 @@ from scipy.special import stdtrit
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.problem import Setup
+from semcal_ros.core.calibration.estimator.thresholds import HELD_PART, SPREAD_COUNT_MIN
+from semcal_ros.core.calibration.judgement.thresholds import (
+    HYSTERESIS_FALSE_ALARMS,
+    ONE_DIRECTION,
+    SURPRISING_SIGMAS,
+)
 from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.views import show_lines
@@ -37,18 +43,6 @@ __all__ = [
     "find_scale_weaknesses",
     "measure_excess",
 ]
-
-# Ratio of the smaller to the larger spread of the tilts: tilts of 30 degrees about one axis, with 3
-# degrees about the other.
-_ONE_DIRECTION = 0.01
-# Part of the prior's 1-sigma of its change above which a parameter is not determined.
-_UNDETERMINED = 0.8
-# Fewer visits than this that show their effect do not tell a spread: its own 1-sigma is a third of it.
-_ENOUGH_VISITS = 4.0
-# Constant error of a stage, in 1-sigmas of its prior, that says that the configuration is wrong.
-_SURPRISING = 4.0
-# Probability with which chance alone gives as large a hysteresis: a false alarm in 3000 calibrations.
-_CHANCE = 3e-4
 
 
 @dataclass(frozen=True)
@@ -71,7 +65,7 @@ class Hysteresis:
     @property
     def is_significant(self) -> bool:
         """Whether chance hardly explains it, by Student's t-test."""
-        limit = float(stdtrit(self.pairs - 1, 1.0 - 0.5 * _CHANCE))
+        limit = float(stdtrit(self.pairs - 1, 1.0 - 0.5 * HYSTERESIS_FALSE_ALARMS))
         return bool(abs(self.relative) > limit * self.sigma)
 
 
@@ -108,7 +102,7 @@ def estimate_hysteresis(setup: Setup, fit: JointFit) -> Hysteresis | None:
 
 
 def _is_repeatability_known(fit: JointFit) -> bool:
-    return fit.adjustment.spread.scale.visible >= _ENOUGH_VISITS
+    return fit.adjustment.spread.scale.visible >= SPREAD_COUNT_MIN
 
 
 def estimate_repeatability(setup: Setup, fit: JointFit) -> float:
@@ -125,7 +119,7 @@ def estimate_repeatability(setup: Setup, fit: JointFit) -> float:
 def _tilts_span_one_direction(rotations: Array) -> bool:
     lean = rotations[:, :2, 2]
     values = np.linalg.eigvalsh(lean.T @ lean)
-    return bool(values[0] < _ONE_DIRECTION * values[1])
+    return bool(values[0] < ONE_DIRECTION * values[1])
 
 
 def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[Finding]:
@@ -150,7 +144,7 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
                     "configuration says, so its tilts have the wrong sign: add 180 to stage.tilt_axis_deg"
                 )
             )
-        elif abs(value) > _SURPRISING * sigma:
+        elif abs(value) > SURPRISING_SIGMAS * sigma:
             out.append(
                 Finding(
                     f"scale: the {label} of the stage is {np.degrees(value):+.1f} degrees off from what "
@@ -159,7 +153,7 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
             )
     camera = model.at(float(setup.magnifications[0]))
     assert camera.covariance is not None
-    if camera.rho < -_SURPRISING * np.sqrt(camera.covariance[5, 5]):
+    if camera.rho < -SURPRISING_SIGMAS * np.sqrt(camera.covariance[5, 5]):
         out.append(
             Finding(
                 "scale: the images look as if the beam diverged upwards, so the tilts of the stage have "
@@ -218,7 +212,7 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
         else "record also with the scan rotated by 90 degrees, or give the stage's tilt"
     )
     for name, label in (("aspect", "aspect ratio"), ("skew", "skew")):
-        limit = _UNDETERMINED * setup.change_prior_of(name)
+        limit = HELD_PART * setup.change_prior_of(name)
         weak = {g: sigma for g, sigma in sigmas[name].items() if sigma > limit}
         if not weak:
             continue

@@ -42,6 +42,7 @@ from semcal_ros.core.calibration.judgement.revision import (
     make_setup,
     revise,
 )
+from semcal_ros.core.calibration.judgement.thresholds import AGEING_MAX, DEFAULT_AGEING, SHAPE_PART
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
@@ -49,20 +50,11 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
 __all__ = [
-    "DEFAULT_AGEING",
     "CalibrationUpdate",
     "ageing_sigmas",
     "change_directions",
     "update_calibration",
 ]
-
-#: 1-sigma of a relative change of the scale since the calibration that the views need not prove: half of the 1 %
-#: that makers promise of the stability of a magnification.
-DEFAULT_AGEING = 5e-3
-# The part of it by which the shape changes: it is made by the ratios of what makes the scale.
-_SHAPE_PART = 0.2
-# More ageing than this is another microscope.
-_MOST_AGEING = 0.1
 
 
 @dataclass(frozen=True)
@@ -120,8 +112,8 @@ def update_calibration(
     InvalidValueError
         If the ageing is not from 0 to 0.1.
     """
-    if not 0.0 <= ageing <= _MOST_AGEING:
-        raise InvalidValueError(f"an ageing of {ageing:g}", expected=f"0 to {_MOST_AGEING:g}")
+    if not 0.0 <= ageing <= AGEING_MAX:
+        raise InvalidValueError(f"an ageing of {ageing:g}", expected=f"0 to {AGEING_MAX:g}")
     check = check_calibration(model, views, image_size=image_size, untilted=untilted, axis=axis)
     if check.verdict is Verdict.INVALID:
         raise CalibrationError(
@@ -173,7 +165,7 @@ def ageing_sigmas(ageing: float, image_width: int) -> dict[str, float]:
     """
     # The scale displaces the edge by ageing x half a width; so do xi_r and xi_t there, at a distance of 1. The
     # centre of the distortion moves by that displacement itself.
-    part = _SHAPE_PART * ageing
+    part = SHAPE_PART * ageing
     sigmas = dict.fromkeys(CHANGING, part) | dict.fromkeys(("ex", "ey"), part * 0.5 * image_width)
     return sigmas | {"scale": ageing}
 

@@ -43,12 +43,12 @@ from semcal_ros.core.calibration.estimator.poses import (
     resolve_mirrored_tilts,
 )
 from semcal_ros.core.calibration.estimator.problem import (
-    HELD_SIGMA,
     Setup,
     build_problem,
     constant_functions,
     stack_coefficients,
 )
+from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
@@ -66,11 +66,12 @@ __all__ = [
     "table_functions",
 ]
 
-# The cubic has 10 terms per coordinate.
+# Derived: the cubic has 10 terms per coordinate, and two more corners show its residuals.
 _FEWEST_CORNERS = 12
 
 
-# Level of the F-test: seven magnifications without distortion are all recognised in 99 % of cases.
+# Defined: the false-alarm rate of the F-test. Seven magnifications without distortion are all recognised in 99 % of
+# cases.
 _SIGNIFICANCE = 1e-3
 
 

@@ -275,8 +275,8 @@ def pda_functions(
     return functions, covariance
 
 
-# Magnifications beyond the order (or degree): 2 that a fit needs, and 1 that can be left out of it
-# for the held-out error.
+# Derived: magnifications beyond the order (or degree), 2 that a fit needs and 1 that can be left out of it for the
+# held-out error.
 _SPARE = 3
 
 

@@ -1,0 +1,190 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The numbers of visual servoing, each with its source."""
+
+from __future__ import annotations
+
+from semcal_ros.core.thresholds import Table
+
+TABLE = Table()
+
+# A row takes three lines, and not one for each of its parts.
+# fmt: off
+
+# The target, in target.py
+
+RATIO = TABLE.defined(
+    "RATIO", 3, "ratio",
+    "Of the cells of one level to those of the next: the middle cell of 3 x 3 holds the next board.",
+)
+MARKER_SIDE = TABLE.stated(
+    "MARKER_SIDE", 0.7, "of a cell",
+    "Of a marker. It leaves a white border of 0.15 of a cell, wider than one square of the marker, 0.7 / 6 = 0.12.",
+)
+MARKER_BITS = TABLE.defined(
+    "MARKER_BITS", 6, "squares",
+    "Along a side of a marker, as generated from the dictionary.",
+)
+LEVELS_MAX = TABLE.derived(
+    "LEVELS_MAX", 6, "levels",
+    "Eight markers in each: the fifty of the dictionary are enough for six.",
+)
+
+# Detection of markers, in detection.py
+
+SEARCHED_PX = TABLE.cost(
+    "SEARCHED_PX", 1024, "px",
+    "Larger pictures are averaged down by a whole factor to find the markers; their sides are then measured at full "
+    "resolution.",
+)
+SIDE_MIN_PX = TABLE.stated(
+    "SIDE_MIN_PX", 18.0, "px",
+    "Of a marker: three pixels for each of the six squares along a side.",
+)
+SEARCH_BLUR_PX = TABLE.stated(
+    "SEARCH_BLUR_PX", 1.0, "px",
+    "Sigma of the smoothing for the search: a third of the smallest square that can be read.",
+)
+SIDE_ENDS = TABLE.stated(
+    "SIDE_ENDS", 0.14, "of a side",
+    "That is left out at each end, where the window would meet the next side.",
+)
+WINDOW = TABLE.stated(
+    "WINDOW", 0.11, "of a side",
+    "Half width of the window across it; border and frame of a marker are wider.",
+)
+WINDOW_MIN_PX = TABLE.stated(
+    "WINDOW_MIN_PX", 2.0, "px",
+    "Of that half width: an edge has to lie in it with its blur.",
+)
+WINDOW_MAX_PX = TABLE.cost(
+    "WINDOW_MAX_PX", 6.0, "px",
+    "Of that half width.",
+)
+WINDOW_ROUNDS = TABLE.cost(
+    "WINDOW_ROUNDS", 4, "rounds",
+    "In which the windows are laid over the corners found last.",
+)
+SETTLED_PX = TABLE.stated(
+    "SETTLED_PX", 0.02, "px",
+    "Movement of the corners after which that ends: what they are uncertain by at best.",
+)
+PLACES_MAX = TABLE.cost(
+    "PLACES_MAX", 96, "places",
+    "Along a side, at which its step is measured: neighbours that are closer than a pixel share their noise.",
+)
+STEP_SIGMAS = TABLE.derived(
+    "STEP_SIGMAS", 3.5, "sigma",
+    "From the line through the others, beyond which a step is dust: by chance one of 2100 (normal, both sides).",
+)
+RAGGED_PART = TABLE.stated(
+    "RAGGED_PART", 0.5, "of the window",
+    "Steps that scatter by more do not form a line.",
+)
+CONTRAST_MIN = TABLE.stated(
+    "CONTRAST_MIN", 2.0, "sigma",
+    "Of a side, in standard deviations of its pixels from the two levels.",
+)
+PLACES_MIN = TABLE.stated(
+    "PLACES_MIN", 6, "places",
+    "On a side, also after outliers were left out: three for each unknown.",
+)
+
+# The pose of the target, in pose.py
+
+POSE_STEPS_MAX = TABLE.cost(
+    "POSE_STEPS_MAX", 12, "steps",
+    "From the similarity they converge quadratically, or not at all.",
+)
+POSE_SETTLED_PX = TABLE.derived(
+    "POSE_SETTLED_PX", 1e-6, "px",
+    "Movement of the corners in the last step: far below their errors, some hundredths of a pixel.",
+)
+MISREAD_PART = TABLE.stated(
+    "MISREAD_PART", 0.25, "of a side",
+    "From its expected position, from which a marker was misread.",
+)
+
+# The camera, in plane_camera.py
+
+SAME_MATRIX = TABLE.derived(
+    "SAME_MATRIX", 1e-9, "of an element",
+    "Difference of two matrices from the same numbers, one divided and multiplied by rho again: rounding is some "
+    "1e-15, and single precision would be 1e-7.",
+)
+
+# The axis of the zoom, in axis.py
+
+SAME_SCALE = TABLE.stated(
+    "SAME_SCALE", 0.002, "of the scale",
+    "Scales that differ by less are of one magnification: if the cameras still differ, another calibration has come "
+    "into force.",
+)
+SCALE_SIGMA = TABLE.stated(
+    "SCALE_SIGMA", 0.003, "of the scale",
+    "1-sigma of a camera's: it also moves points that are off the axis.",
+)
+
+# Commands and drift, in motion.py
+
+COMMANDS_KEPT = TABLE.cost(
+    "COMMANDS_KEPT", 1024, "commands",
+    "Those of 30 s, LATENCY_MAX_S, at 34 a second.",
+)
+GATE_SIGMAS = TABLE.derived(
+    "GATE_SIGMAS", 5.0, "sigma",
+    "Of an innovation that is not drift: by chance one of 870 000 frames (normal, both sides, two axes).",
+)
+ODD_MAX = TABLE.stated(
+    "ODD_MAX", 4, "frames",
+    "In a row beyond the gate, that are drift after all.",
+)
+DRIFT_FACTOR = TABLE.stated(
+    "DRIFT_FACTOR", 10.0, "ratio",
+    "On the expected drift in that case.",
+)
+JUDGED_PX = TABLE.stated(
+    "JUDGED_PX", 36.0, "px",
+    "Commanded travel after which the stage is judged: well above drift and noise in that time.",
+)
+TRAVEL_MIN = TABLE.stated(
+    "TRAVEL_MIN", 0.3, "of the command",
+    "That has to be seen of it.",
+)
+TRAVEL_MAX = TABLE.stated(
+    "TRAVEL_MAX", 3.0, "of the command",
+    "And at most.",
+)
+
+# The control law, in law.py
+
+GAIN_MAX = TABLE.derived(
+    "GAIN_MAX", 0.5, "of the error",
+    "That is removed per frame. With the latency predicted, up to 2 is stable; without, 0.5 is still stable for a "
+    "latency of two frames, whose limit is 0.618.",
+)
+GAIN_WITHOUT_TIMES_MAX = TABLE.derived(
+    "GAIN_WITHOUT_TIMES_MAX", 0.25, "of the error",
+    "Without times the latency cannot be predicted; a quarter does not overshoot with one frame of it, as 1 / 4 is "
+    "where both roots of z^2 - z + k are real.",
+)
+LATENCY_MAX_S = TABLE.stated(
+    "LATENCY_MAX_S", 30.0, "s",
+    "Frames and commands of one clock are not farther apart.",
+)
+COMMAND_DELAY = TABLE.stated(
+    "COMMAND_DELAY", 0.5, "frames",
+    "1-sigma of the delay with which a stage obeys a command.",
+)
