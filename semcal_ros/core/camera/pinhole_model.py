@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.thresholds import (
     COEFFICIENT_POWERS,
@@ -174,7 +175,9 @@ def fit_pinhole(camera: ScanCamera, coefficients: int = 5) -> PinholeModel:
 
 def _is_pinhole(camera: ScanCamera) -> bool:
     """Return whether a camera has neither distortion nor skew, as that of rectified images."""
-    return camera.residual is None and camera.xi_r == camera.xi_t == camera.skew == 0.0
+    terms = ALL_NAMES[len(PARAMETER_NAMES) :]
+    bends = (getattr(camera, name) for name in ("xi_r", "xi_t", "skew", *terms))
+    return camera.residual is None and not any(bends)
 
 
 def _sample(camera: ScanCamera) -> tuple[Array, Array]:

@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices
+from semcal_ros.core.camera.distortion import distort_jacobians
 from semcal_ros.core.camera.scan_distortion import scan_functions
 from semcal_ros.core.camera.thresholds import (
     FIELD_BREAKS_X,
@@ -312,10 +313,10 @@ class ResidualField:
         """
         q, weight = _quadrature(self.knots_x, self.knots_y)
         x, y = q.T
-        zero, one, r2 = np.zeros_like(x), np.ones_like(x), x * x + y * y
+        zero, one = np.zeros_like(x), np.ones_like(x)
         patterns = [(one, zero), (zero, one), (x, zero), (y, zero), (zero, x), (zero, y)]
-        patterns += [(r2 * x, r2 * y), (r2 + 2.0 * x * x, r2 + 2.0 * y * y)]
-        patterns += [(-r2 * y, r2 * x), (r2 + 2.0 * x * x, -r2 - 2.0 * y * y)]
+        # A term of the lens that is small is its derivative.
+        patterns += list(np.moveaxis(distort_jacobians(q, 0.0, 0.0)[2], (2, 1), (0, 1)))
         patterns += [(along, zero) for along in scan_functions(x, 0)]
         patterns += [(zero, across) for across in scan_functions(y / np.max(np.abs(y)), 1)]
         basis = self.at(self.g_range[0]).basis(q) * weight[:, None]

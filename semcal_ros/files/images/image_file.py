@@ -88,7 +88,8 @@ class ImageFile:
     pages
         At least one.
     read
-        Yields the stored images of the pages, (h, w) grey levels with the databar.
+        Yields the stored images of the pages, (h, w) grey levels with the databar. It raises where it yields, so that
+        what is wrong with one image counts for that image only.
     time
         Local time of the first image, or None.
     notes
@@ -213,10 +214,14 @@ def _describe_plain(path: Path) -> ImageFile:
     except SemcalError as error:
         why = str(error)
     page = ImagePage(size) if settings is None else _page_of(settings, size)
+
+    def read() -> Iterator[NDArray[Any]]:
+        yield read_plain_image(path)
+
     return ImageFile(
         path,
         (page,),
-        lambda: iter([read_plain_image(path)]),
+        read,
         taken if settings is None else settings.time,
         () if settings is None else settings.notes,
         "" if page.pixel_size_m else why,

@@ -262,6 +262,17 @@ def test_an_image_that_is_damaged_is_left_out(tmp_path: Path) -> None:
         assert len(recording.rejected) == 2
 
 
+@pytest.mark.parametrize("suffix", ["bmp", "png"])
+def test_a_picture_that_ends_early_costs_that_picture_only(tmp_path: Path, suffix: str) -> None:
+    for k, frame in enumerate(FRAMES):
+        cv2.imwrite(str(tmp_path / f"{k}.{suffix}"), frame)
+    cut = tmp_path / f"2.{suffix}"
+    cut.write_bytes(cut.read_bytes()[:-200])
+    with open_recording(RecordedFiles(tmp_path, 1e-8), CONFIG) as recording:
+        frames = list(recording.frames())
+    assert [f.image.tolist() for f in frames] == FRAMES[[0, 1, 3]].tolist()
+
+
 @pytest.mark.parametrize("declared", [True, False])
 def test_lines_of_a_bidirectional_scan_are_moved_back_where_declared(
     tmp_path: Path, declared: bool
