@@ -21,7 +21,7 @@ specimen is a ball.
 
 from __future__ import annotations
 
-from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
+from semcal_ros.applications.reconstruction.adjustment import AdjustedStructure, adjust
 from semcal_ros.applications.reconstruction.ball import Ball, measure_ball
 from semcal_ros.applications.reconstruction.factorization import AffineStructure, factorize
 from semcal_ros.applications.reconstruction.feature_tracks import (
@@ -45,7 +45,7 @@ from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 
 __all__ = [
-    "Adjustment",
+    "AdjustedStructure",
     "AffineStructure",
     "Ball",
     "MetricUpgrade",

@@ -39,7 +39,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 
 
 @dataclass(frozen=True, eq=False)
-class Adjustment:
+class AdjustedStructure:
     """Adjusted structure with its uncertainty.
 
     Attributes
@@ -202,7 +202,7 @@ def adjust(
     height_sigma_m: float = 5e-6,
     max_iterations: int = 40,
     tolerance: float = 1e-7,
-) -> Adjustment:
+) -> AdjustedStructure:
     """Adjust points and poses to observations.
 
     Parameters
@@ -341,7 +341,7 @@ def _finish(
     unit_m: float,
     iterations: int,
     converged: bool,
-) -> Adjustment:
+) -> AdjustedStructure:
     pose, point, coupling, _, _ = problem.normal(state, sigma)
     inverse = _invert(_damp(point, 1e-12))
     reduced, moved = _form_schur_complement(pose, inverse, coupling, free)
@@ -360,7 +360,7 @@ def _finish(
     factor = np.array([1.0, 1.0, 1.0, unit_m, unit_m, unit_m])
     error = problem.residuals(state)[0]
     white = problem.whiten(error) / sigma
-    return Adjustment(
+    return AdjustedStructure(
         rotations=state.rotations,
         translations_m=state.translations * unit_m,
         points_m=state.points * unit_m,

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from semcal_ros.applications.reconstruction.adjustment import Adjustment, adjust
+from semcal_ros.applications.reconstruction.adjustment import AdjustedStructure, adjust
 from semcal_ros.applications.reconstruction.appearance import compute_log_grey
 from semcal_ros.applications.reconstruction.factorization import factorize
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
@@ -129,7 +129,7 @@ class Structure:
     points_m: Array
     normals: Array
     curvature_1_m: Array
-    adjustment: Adjustment
+    adjustment: AdjustedStructure
     observations: Observations
     frames: Indices
     cameras: tuple[ScanCamera, ...]
@@ -266,7 +266,7 @@ class _Refinement:
         self.rotations, self.translations, self.points = rotations, translations, points
         self.seen = observations
         self.log_greys: list[Image] = []
-        self.adjusted: Adjustment | None = None
+        self.adjusted: AdjustedStructure | None = None
         self.ids = np.arange(len(points))
         self.passes, self.converged = 0, False
         self.pixel_m = float(np.mean([np.mean(camera.pixel_size_m) for camera in cameras]))

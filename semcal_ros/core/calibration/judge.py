@@ -217,7 +217,7 @@ class CalibrationResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """The findings as plain sentences, the most costly in nm first."""
-        return tuple(own.tell(self.model) for own in rank_findings(self.findings, self.model))
+        return tuple(own.sentence(self.model) for own in rank_findings(self.findings, self.model))
 
 
 def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:

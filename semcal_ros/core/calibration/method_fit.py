@@ -69,7 +69,7 @@ class Finding:
         except InvalidValueError:
             return math.nan, math.nan
 
-    def tell(self, model: CalibrationModel) -> str:
+    def sentence(self, model: CalibrationModel) -> str:
         """Return the sentence, with what it costs in nm."""
         cost_nm, g = self.cost(model)
         if not math.isfinite(cost_nm):

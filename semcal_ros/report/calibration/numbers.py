@@ -131,7 +131,9 @@ def compute_fitted_inner_px(result: CalibrationResult) -> float | None:
 
 def collect_warnings(result: CalibrationResult, rejected: Sequence[RejectedView] = ()) -> list[str]:
     """Collect what was found about the calibration as sentences, the most costly first."""
-    return [_format_sentence(finding.tell(result.model)) for finding in find_all(result, rejected)]
+    return [
+        _format_sentence(finding.sentence(result.model)) for finding in find_all(result, rejected)
+    ]
 
 
 def _format_sentence(text: str) -> str:

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
-from semcal_ros.core.calibration.judgement.plan import Verdict, judge_calibration
+from semcal_ros.core.calibration.judgement.plan import Judgement, judge_calibration
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -285,7 +285,7 @@ def _span_nm(result: CalibrationResult, rms_px: Mapping[float, float]) -> str:
     return largest if largest.startswith(f"{least} ") else f"{least} to {largest}"
 
 
-def suggest_commands(verdict: Verdict, calibration: str) -> list[tuple[str, str]]:
+def suggest_commands(verdict: Judgement, calibration: str) -> list[tuple[str, str]]:
     """Suggest what to run next.
 
     Parameters

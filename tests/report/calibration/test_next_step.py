@@ -27,14 +27,14 @@ from click.testing import CliRunner
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.at_command import command as at_command
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.calibration.judgement.plan import PlannedVisit, Verdict
+from semcal_ros.core.calibration.judgement.plan import Judgement, PlannedVisit
 from semcal_ros.report import write_calibration_report
 from semcal_ros.report.calibration import page
 from semcal_ros.report.calibration.page import suggest_commands
 from semcal_ros.report.html import encode
 from tests.helpers.report_samples import Page
 
-GOOD = Verdict(100.0, 5000.0, 0.002, 147.0, 1e-6, 0.001, None)
+GOOD = Judgement(100.0, 5000.0, 0.002, 147.0, 1e-6, 0.001, None)
 
 
 def test_a_visit_is_planned_and_used() -> None:

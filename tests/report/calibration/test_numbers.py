@@ -283,7 +283,7 @@ def test_what_costs_most_comes_first_and_says_how_many_nm(result: CalibrationRes
     residuals[6] = 60.0 * residuals[6]
     fit = replace(result.fit, residuals_px=tuple(residuals))
     bad = replace(result, held_out_rms_px=held_out, fit=fit)
-    found = [own.tell(result.model) for own in find_all(bad)]
+    found = [own.sentence(result.model) for own in find_all(bad)]
     costs = [re.search(r"costs ([\d.e+]+) nm at (\d+)x", text) for text in found]
     assert costs[0] is not None and costs[1] is not None
     assert "corners of" in found[0] and "predicted badly" in found[1]

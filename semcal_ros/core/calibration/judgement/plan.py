@@ -62,8 +62,8 @@ from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.wording import rounded_magnification
 
 __all__ = [
+    "Judgement",
     "PlannedVisit",
-    "Verdict",
     "ViewPlan",
     "judge_calibration",
     "plan_views",
@@ -321,7 +321,7 @@ def _turn(angle: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Judgement:
     """How well a calibration knows nm per pixel.
 
     Attributes
@@ -402,7 +402,7 @@ class Verdict:
         )
 
 
-def judge_calibration(model: CalibrationModel) -> Verdict:
+def judge_calibration(model: CalibrationModel) -> Judgement:
     """Judge how well a calibration knows nm per pixel, and what would improve that most."""
     largest, at = worst_pixel_size(model)
     low, high = model.magnification_range
@@ -420,7 +420,7 @@ def judge_calibration(model: CalibrationModel) -> Verdict:
             if first is not None and first.largest < (1.0 - VISIT_WORTH) * largest:
                 visit = first
     conditions = model.provenance.describe_essentials()
-    return Verdict(
+    return Judgement(
         float(low),
         float(high),
         largest,
