@@ -61,23 +61,6 @@ from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = [
-    "AcquisitionGoal",
-    "Proposal",
-    "ViewRequest",
-    "find_exposure_fault",
-    "find_picture_fault",
-    "find_stage_move",
-    "grid_is_centred",
-    "image_from_stage",
-    "is_magnification_of",
-    "is_same_magnification",
-    "lattice_shift",
-    "plan_survey",
-    "propose_visits",
-    "request_of_picture",
-]
-
 
 def _middle_off_px(detection: LatticeDetection) -> Array:
     box = 0.5 * (detection.xy.min(axis=0) + detection.xy.max(axis=0))

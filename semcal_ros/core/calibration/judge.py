@@ -49,17 +49,6 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
-__all__ = [
-    "CalibrationResult",
-    "collect_statistics",
-    "describe_field",
-    "describe_fit",
-    "describe_shares",
-    "describe_stage",
-    "judge",
-    "list_undetermined",
-]
-
 
 def describe_field(fitted: FittedField | None) -> dict[str, Any] | None:
     """Describe how the residual field was chosen, or return None without one."""

@@ -30,8 +30,6 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import in_nm, rounded_magnification
 
-__all__ = ["Finding", "MethodFit", "make_model", "rank_findings"]
-
 
 @dataclass(frozen=True)
 class Finding:

@@ -24,8 +24,6 @@ from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.camera.calibration_model import ScaleSigma
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["METHODS", "RESIDUAL_MODES", "CalibrationOptions", "MethodOptions"]
-
 METHODS = ("joint", "pda", "discrete")
 RESIDUAL_MODES = ("auto", "off", "on")
 

@@ -94,7 +94,7 @@ from semcal_ros.core.calibration.views import (
     ViewStatus,
     refuse_tilted_lines,
 )
-from semcal_ros.core.corners.detection import MINIMUM_CORNERS
+from semcal_ros.core.corners.thresholds import MINIMUM_CORNERS
 from semcal_ros.core.errors import (
     CalibrationError,
     InvalidValueError,
@@ -102,8 +102,6 @@ from semcal_ros.core.errors import (
     UnusableCalibrationError,
 )
 from semcal_ros.core.wording import counted
-
-__all__ = ["are_enough", "calibrate_views", "fit_joint", "prepare"]
 
 
 def calibrate_views(

@@ -83,16 +83,6 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 from semcal_ros.core.errors import UnusableCalibrationError
 
-__all__ = [
-    "Selection",
-    "Summary",
-    "candidate_names",
-    "excess_px",
-    "select",
-    "select_and_adjust",
-    "select_functions",
-]
-
 # What a function may be: a polynomial in log g or in g.
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
 

@@ -77,8 +77,6 @@ from semcal_ros.core.calibration.thresholds import (
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
-__all__ = ["JointFit", "solve", "without_magnification"]
-
 
 @dataclass(frozen=True)
 class JointFit:

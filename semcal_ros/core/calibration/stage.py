@@ -47,19 +47,6 @@ from semcal_ros.core.calibration.thresholds import FRAMES_MIN, ONE_LINE_RATIO, O
 from semcal_ros.core.camera.plane_geometry import cross_products, rotations_from_vectors
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "OFFSET_NAMES",
-    "Attitudes",
-    "StageAxis",
-    "StageIsotropy",
-    "StageReading",
-    "attitude_residuals",
-    "attitudes",
-    "fit_stage_moves",
-    "height_of_tilt",
-    "stage_rotations",
-]
-
 OFFSET_NAMES: tuple[str, ...] = (
     "stage_tilt",
     "stage_axis",

@@ -66,25 +66,6 @@ from semcal_ros.core.calibration.views import GridView, add_excess_noise
 from semcal_ros.core.camera.plane_geometry import fit_homography, view_affine
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 
-__all__ = [
-    "UNTILTED_MODES",
-    "Start",
-    "adapt_priors",
-    "add_shared_unknowns",
-    "advise_scale",
-    "align_lattices",
-    "check_nominal_scale",
-    "check_square_sides",
-    "is_scale_far",
-    "look_untilted",
-    "mark_untilted",
-    "measure_misfit_px",
-    "observed_scale_factor",
-    "start",
-    "tempered",
-    "with_excess",
-]
-
 _UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
 
 

@@ -38,20 +38,6 @@ from semcal_ros.core.calibration.thresholds import (
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 
-__all__ = [
-    "FoundView",
-    "GridView",
-    "RejectedView",
-    "SquareAssignment",
-    "ViewStatus",
-    "add_excess_noise",
-    "assign_squares",
-    "estimate_excess_sigma_px",
-    "refuse_tilted_lines",
-    "show_lines",
-    "views_from_detections",
-]
-
 
 @dataclass(frozen=True)
 class GridView:

@@ -80,9 +80,6 @@ from semcal_ros.core.corners.thresholds import (
 )
 from semcal_ros.core.errors import Rejection
 
-__all__ = ["MINIMUM_CORNERS", "LatticeDetection", "LatticeStatus", "find_lattice"]
-
-
 _POINTS = {
     "chess": "corners",
     "dots": "dots",

@@ -51,15 +51,6 @@ from semcal_ros.core.ladder.thresholds import (
     SHIFT_STEPS,
 )
 
-__all__ = [
-    "PictureRequest",
-    "TakenPicture",
-    "find_offset",
-    "learn_motion",
-    "plan_pictures",
-    "take_picture",
-]
-
 
 @dataclass(frozen=True)
 class PictureRequest:

@@ -53,15 +53,6 @@ from semcal_ros.core.ladder.thresholds import (
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup, LadderState, jump_sigmas, slope_sigma
 
-__all__ = [
-    "DriftSpread",
-    "LadderFit",
-    "add_up",
-    "adjust",
-    "prior_information",
-    "share_noise",
-]
-
 
 @dataclass(frozen=True)
 class DriftSpread:

@@ -42,17 +42,6 @@ from semcal_ros.core.ladder.thresholds import (
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup
 
-__all__ = [
-    "FLIPS",
-    "Disagreement",
-    "Flip",
-    "Misstatement",
-    "find_misstatement",
-    "flip_match",
-    "measure_disagreement",
-    "minus_log_evidence",
-]
-
 
 @dataclass(frozen=True)
 class Flip:

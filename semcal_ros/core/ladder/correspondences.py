@@ -73,15 +73,6 @@ from semcal_ros.core.registration.tiles import (
     tile_window,
 )
 
-__all__ = [
-    "Correspondences",
-    "PairFailure",
-    "Prepared",
-    "SmoothMap",
-    "locate_picture",
-    "match_pictures",
-]
-
 
 class PairFailure(Enum):
     """Why two pictures were not matched."""

@@ -79,21 +79,6 @@ from semcal_ros.core.ladder.unknowns import (
 )
 from semcal_ros.core.wording import counted
 
-__all__ = [
-    "LadderMeasurement",
-    "LadderResult",
-    "LadderStep",
-    "check_fit",
-    "creep_of",
-    "describe_ladder",
-    "describe_steps",
-    "extend_calibration",
-    "find_unrest",
-    "make_model",
-    "measure_ladder",
-    "scale_of_pictures",
-]
-
 
 @dataclass(frozen=True)
 class LadderStep:

@@ -62,15 +62,6 @@ from semcal_ros.core.ladder.thresholds import (
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup
 
-__all__ = [
-    "METHOD",
-    "KnownLength",
-    "ScaleAnchor",
-    "SpecimenCalibration",
-    "StageMoves",
-    "calibrate_from_specimen",
-]
-
 #: The method of the calibration, as its file says it.
 METHOD = "specimen"
 

@@ -45,20 +45,6 @@ from semcal_ros.core.ladder.thresholds import (
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup, start_state
 
-__all__ = [
-    "LadderPicture",
-    "Match",
-    "RejectedPair",
-    "Turns",
-    "calibrated_xy",
-    "check_connected",
-    "check_steps",
-    "compare_turns",
-    "make_predictor",
-    "match_all",
-    "picture_xy",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class LadderPicture:

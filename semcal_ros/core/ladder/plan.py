@@ -26,8 +26,6 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.ladder.thresholds import ANCHORS, LADDER_MOVES, MAGNIFICATION_MAX, STEP
 
-__all__ = ["PlannedStep", "plan_ladder"]
-
 
 @dataclass(frozen=True)
 class PlannedStep:

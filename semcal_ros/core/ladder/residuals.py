@@ -41,16 +41,6 @@ from semcal_ros.core.camera.scan_distortion import Raster
 from semcal_ros.core.ladder.thresholds import POSE_SIZE, SLOPE_STEPS, TIME_STEPS
 from semcal_ros.core.ladder.unknowns import LadderSetup, LadderState
 
-__all__ = [
-    "Link",
-    "PairRows",
-    "camera_of",
-    "make_link",
-    "pair_rows",
-    "pair_values",
-    "place_on_specimen",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Link:

@@ -62,16 +62,6 @@ from semcal_ros.core.ladder.thresholds import (
     VISIT_SIGMA_MIN,
 )
 
-__all__ = [
-    "LadderSetup",
-    "LadderState",
-    "PicturePlace",
-    "extend_functions",
-    "make_setup",
-    "prior_root",
-    "start_state",
-]
-
 # Pictures of a flat specimen from above tell nothing of these.
 _UNSEEN = ("px", "py", "rho")
 

@@ -43,23 +43,6 @@ from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES, camera
 from semcal_ros.core.camera.scan_distortion import Raster
 from semcal_ros.core.errors import CalibrationError
 
-__all__ = [
-    "GRID_NAMES",
-    "MISS_NAMES",
-    "Block",
-    "Effects",
-    "Layout",
-    "Problem",
-    "State",
-    "empty_effects",
-    "make_problem",
-    "pick_views",
-    "retract",
-    "select_views",
-    "states_of",
-    "with_states_of",
-]
-
 GRID_NAMES: tuple[str, ...] = ("grid_stretch", "grid_shear", "grid_curvature_m")
 """Stretch (x longer and y shorter by half of it), shear (x moves with y), and curvature in 1/m."""
 MISS_NAMES: tuple[str, ...] = ("axis_x_m", "axis_y_m", "axis_z_m")

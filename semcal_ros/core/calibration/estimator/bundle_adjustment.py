@@ -69,17 +69,6 @@ from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, St
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 
-__all__ = [
-    "SMOOTH",
-    "SMOOTH_AT_LAST",
-    "Adjustment",
-    "BundleResult",
-    "refine",
-    "refit_functions",
-    "variance_factor",
-    "weighted_squares",
-]
-
 
 @dataclass(frozen=True)
 class BundleResult:

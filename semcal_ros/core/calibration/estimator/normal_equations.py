@@ -35,16 +35,6 @@ from semcal_ros.core.calibration.estimator.residuals import (
     view_residuals,
 )
 
-__all__ = [
-    "Eliminated",
-    "NormalEquations",
-    "damped_diagonal",
-    "normal_equations",
-    "reduced_normal_equations",
-    "schur_complement",
-    "sum_by",
-]
-
 
 @dataclass(frozen=True)
 class NormalEquations:

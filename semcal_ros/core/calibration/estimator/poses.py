@@ -63,21 +63,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = [
-    "InitialValues",
-    "adjust",
-    "adjust_with_other_poses",
-    "initial_values",
-    "mirror",
-    "pose_from_camera",
-    "refine_coarsely",
-    "resolve_mirrored_tilts",
-    "restart_poses",
-    "right_way_up",
-    "thin_view",
-    "try_other_poses",
-]
-
 
 @dataclass(frozen=True)
 class InitialValues:

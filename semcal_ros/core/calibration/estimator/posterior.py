@@ -79,20 +79,6 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.fit_record import Certificate
 from semcal_ros.core.errors import UnusableCalibrationError
 
-__all__ = [
-    "CovarianceParts",
-    "LineJitter",
-    "PaddedAdjustment",
-    "certify",
-    "estimate_changes",
-    "estimate_jitter",
-    "jitter_covariance",
-    "pad",
-    "pad_covariance",
-    "pattern_covariance",
-    "split_covariance",
-]
-
 
 def certify(functions: Functions, problem: Problem, result: BundleResult) -> Certificate:
     """Certify an adjustment.

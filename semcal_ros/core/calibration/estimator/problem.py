@@ -47,25 +47,6 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
 
-__all__ = [
-    "Functions",
-    "Priors",
-    "Setup",
-    "Spread",
-    "VarianceComponents",
-    "build_problem",
-    "constant_functions",
-    "initial_components",
-    "prior_vectors",
-    "stack_coefficients",
-    "stack_theta",
-    "usual_lattice_sigmas",
-    "with_coefficients",
-    "with_shared",
-    "with_shared_values",
-]
-
-
 # The amplifiers of the scan change these at a breakpoint.
 _JUMPING = ("scale", "aspect", "skew")
 

@@ -57,19 +57,6 @@ from semcal_ros.core.calibration.estimator.thresholds import (
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.errors import UnusableCalibrationError
 
-__all__ = [
-    "FieldChoice",
-    "FieldSystem",
-    "FittedField",
-    "GridPattern",
-    "blank_field",
-    "choose_field",
-    "field_system",
-    "held_prior",
-    "solve_field",
-    "undo_field",
-]
-
 
 @dataclass(frozen=True)
 class FieldSystem:

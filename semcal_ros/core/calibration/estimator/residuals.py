@@ -47,20 +47,6 @@ from semcal_ros.core.camera.projection import (
     project_points_with_jacobians,
 )
 
-__all__ = [
-    "VIEW_RESIDUALS",
-    "CornerRows",
-    "Residual",
-    "corner_residuals",
-    "corner_rows",
-    "prior_cost",
-    "stack_rows",
-    "view_costs",
-    "view_residuals",
-    "whiten",
-    "whitened_norm",
-]
-
 
 @dataclass(frozen=True)
 class Residual:

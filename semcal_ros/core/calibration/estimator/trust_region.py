@@ -36,8 +36,6 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     PREDICTED_MAX,
 )
 
-__all__ = ["Descent", "DescentStatus", "Step", "descend"]
-
 S = TypeVar("S")
 
 

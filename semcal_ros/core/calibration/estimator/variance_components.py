@@ -51,8 +51,6 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     USUAL_WEIGHT,
 )
 
-__all__ = ["accelerate_components", "largest_change", "limit_components", "update_components"]
-
 
 def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
     """Update a spread from the residuals of its prior, in sigmas, and their posterior variances."""

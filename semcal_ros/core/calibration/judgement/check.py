@@ -55,8 +55,6 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.wording import counted
 
-__all__ = ["CHANGES", "CalibrationCheck", "Change", "ShapeTest", "Verdict", "check_calibration"]
-
 #: Groups of parameters that are tested together, by the name under which a change is reported.
 CHANGES = {
     "scale": ("scale",),

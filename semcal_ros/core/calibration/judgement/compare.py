@@ -38,8 +38,6 @@ from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_s
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["CalibrationDifference", "DifferenceAt", "compare_calibrations"]
-
 
 @dataclass(frozen=True, eq=False)
 class DifferenceAt:

@@ -38,8 +38,6 @@ from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 
-__all__ = ["ScaleError", "ViewPose", "compare_scales", "fit_poses", "rms_by_magnification"]
-
 
 @dataclass(frozen=True)
 class ViewPose:

@@ -46,22 +46,6 @@ from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = [
-    "Cells",
-    "ViewCoverage",
-    "assign_cells",
-    "compute_empty_share",
-    "compute_reached_shares",
-    "compute_tilts_deg",
-    "concatenate_corners",
-    "estimate_pattern_px",
-    "estimate_tilt_deg",
-    "find_all",
-    "find_weaknesses",
-    "measure_view_coverage",
-    "normalise_residuals",
-]
-
 
 @dataclass(frozen=True)
 class ViewCoverage:

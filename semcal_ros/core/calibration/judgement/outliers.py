@@ -53,15 +53,6 @@ from semcal_ros.core.calibration.judgement.thresholds import (
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
 
-__all__ = [
-    "ChangePoint",
-    "Deviations",
-    "find_change_point",
-    "find_outliers",
-    "find_wrong_tilts",
-    "measure_deviations",
-]
-
 
 @dataclass(frozen=True)
 class ChangePoint:

@@ -61,14 +61,6 @@ from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.wording import rounded_magnification
 
-__all__ = [
-    "Judgement",
-    "PlannedVisit",
-    "ViewPlan",
-    "judge_calibration",
-    "plan_views",
-]
-
 
 @dataclass(frozen=True)
 class PlannedVisit:

@@ -66,15 +66,6 @@ from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.errors import CalibrationError
 
-__all__ = [
-    "CHANGING",
-    "Revision",
-    "free_sigmas",
-    "make_setup",
-    "record_of",
-    "revise",
-]
-
 #: Parameters that may have changed since the calibration, by the same amount at all magnifications; that of the
 #: scale is relative.
 CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")

@@ -36,14 +36,6 @@ from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.views import show_lines
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 
-__all__ = [
-    "Hysteresis",
-    "estimate_hysteresis",
-    "estimate_repeatability",
-    "find_scale_weaknesses",
-    "measure_excess",
-]
-
 
 @dataclass(frozen=True)
 class Hysteresis:

@@ -49,13 +49,6 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
-__all__ = [
-    "CalibrationUpdate",
-    "ageing_sigmas",
-    "change_directions",
-    "update_calibration",
-]
-
 
 @dataclass(frozen=True)
 class CalibrationUpdate:

@@ -58,14 +58,6 @@ from semcal_ros.core.camera.plane_geometry import (
     transform_points,
 )
 
-__all__ = [
-    "DiscreteFit",
-    "DistortionCentre",
-    "find_distortion_centre",
-    "fit_discrete",
-    "table_functions",
-]
-
 # Derived: the cubic has 10 terms per coordinate, and two more corners show its residuals.
 _FEWEST_CORNERS = 12
 

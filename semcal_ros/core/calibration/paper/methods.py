@@ -36,8 +36,6 @@ from semcal_ros.core.calibration.paper.pda import (
     try_steps,
 )
 
-__all__ = ["fit_separately"]
-
 
 def fit_separately(setup: Setup, method: str, options: MethodOptions) -> MethodFit:
     """Calibrate each magnification by itself, and make continuous functions of the results."""

@@ -42,20 +42,6 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = [
-    "FittedEquation",
-    "StepTrial",
-    "choose_step",
-    "equation_error",
-    "focal_length_and_skew",
-    "list_equations",
-    "ode_weights",
-    "pda_functions",
-    "prime",
-    "select_magnifications",
-    "try_steps",
-]
-
 
 @dataclass(frozen=True)
 class FittedEquation:
