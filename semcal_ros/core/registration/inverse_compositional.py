@@ -36,9 +36,10 @@ changes along the rows, which were scanned in an instant.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from scipy.special import stdtrit
 
@@ -116,6 +117,14 @@ _MIN_BLOCKS = 36
 _MIN_SHEAR_ROWS = 6
 # Rows of tiles per cosine mode down the frame: the higher ones are of rows that share smoothed noise.
 _ROWS_PER_MODE = 1.5
+# Sides of the squares of tiles that may move by themselves, and the chi-square (2 degrees of freedom) from which one
+# seems to: of some 500 independent squares, one in 20 images, in which it widens the covariance by little.
+_PULL_SIDES, _PULL_CHI2 = (2, 3, 4, 6, 8, 11, 16), 18.4
+# The median of a chi-square, by how many times that the squares scatter where the images differ all over, as by
+# charging; more than that is that of motions. Part of the largest variance that is rounding.
+_MEDIAN_CHI2, _MOST_EXCESS, _ROUNDING = 1.386, 3.0, 1e-6
+# Part of the information that must be elsewhere: the specimen is no smaller part.
+_LEAST_REST = 0.3
 # A shear whose scaled information matrix has a larger condition number is not determined.
 _MAX_CONDITION = 1e6
 # Noise of lines is looked for from this number of rows of tiles on, and found where it makes the
@@ -203,6 +212,22 @@ class Alignment:
     converged: bool
     iterations: int
     _comparison: _Comparison | None = field(default=None, repr=False, compare=False)
+    _left: Array | None = field(default=None, repr=False, compare=False)
+
+    def with_pull(self) -> Alignment:
+        """The same with what a part of the image that moves by itself, and was not found to, may pull, in the
+        covariance.
+        """
+        if self._comparison is None or self._left is None:
+            return self
+        pull = _find_pull(self._comparison, self._left) * self._comparison.level.factor
+        if not np.any(pull):
+            return self
+        joint = self.joint_covariance.copy()
+        joint[:2, :2] += np.outer(pull, pull)
+        return replace(
+            self, covariance=self.covariance + np.outer(pull, pull), joint_covariance=joint
+        )
 
     def fit_similarity(self) -> SimilarityFit | None:
         """Estimate a rotation and a scale, too; None where too few tiles are compared."""
@@ -628,14 +653,19 @@ def _expect_spread(comparison: _Comparison, powers: Array) -> Array:
     A tile has some hundred pixels, and only two scores: of a few tiles it is the better estimate. It does not see what
     moves a tile as a whole.
     """
+    both = np.einsum("tp,tq,tij->piqj", powers, powers, _expect_variances(comparison))
+    return np.asarray(both.reshape(2 * powers.shape[1], -1))
+
+
+def _expect_variances(comparison: _Comparison) -> Array:
+    """(tiles, 2, 2) covariance of each tile's score as the residuals of its pixels tell it."""
     tiles, level, window = _measure_tiles(comparison), comparison.level, comparison.window
     residual = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
     counts = level.pixel_counts[window.rows, window.cols]
     weights = comparison.geometry.normal_matrices[:, 3, 3] / counts.ravel()
     products = level.noise_products[window.rows, window.cols].reshape(-1, 2, 2)
     variances = weights**2 * np.maximum(residual / counts, 0.0).ravel()
-    both = np.einsum("tp,tq,t,tij->piqj", powers, powers, variances, products)
-    return np.asarray(both.reshape(2 * powers.shape[1], -1))
+    return np.asarray(variances[:, None, None] * products)
 
 
 def _widen_few(count: float, estimated: int, blocks: int) -> float:
@@ -659,7 +689,7 @@ def _summarise(
     gain = float(fit.gain[0])
     weights = _tile_information(comparison)
     difference, variance = _compare_halves(comparison, covariance, weights)
-    joint, joint_covariance = _fit_shear(comparison, weights)
+    joint, joint_covariance, left = _fit_shear(comparison, weights)
     factor = level.factor
     return Alignment(
         shift_px=comparison.improved * factor,
@@ -679,6 +709,7 @@ def _summarise(
         converged=converged,
         iterations=passes,
         _comparison=comparison,
+        _left=left,
     )
 
 
@@ -732,8 +763,10 @@ def _compare_halves(
     return difference, variance
 
 
-def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
-    """(4,) shift of the image's middle row and shear, estimated together, and their covariance."""
+def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, Array]:
+    """(4,) shift of the image's middle row and shear, estimated together, their covariance, and the scores (tiles, 2)
+    that they leave.
+    """
     rows, cols = len(comparison.window.y), len(comparison.window.x)
     # The shift is the same for all tiles of a row.
     by_row = np.add.reduce(weights.reshape(rows, cols, 2, 2), axis=1)
@@ -743,7 +776,7 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scaled, scale = equilibrate(information)
     if rows < _MIN_SHEAR_ROWS or not _well_conditioned(scaled):
-        return np.full(4, np.nan), np.full((4, 4), np.inf)
+        return np.full(4, np.nan), np.full((4, 4), np.inf), comparison.fit.scores
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = comparison.fit.scores.reshape(rows, cols, 2)
     step = -inverse @ (powers.T @ np.add.reduce(scores, axis=1)).ravel()
@@ -754,7 +787,59 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     residual = scores + explained[..., 0]
     tilted = np.concatenate([residual, powers[:, 1, None, None] * residual], axis=2)
     each = np.repeat(powers, cols, axis=0)
-    return joint, _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
+    covariance = _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
+    return joint, covariance, residual.reshape(-1, 2)
+
+
+def _find_pull(comparison: _Comparison, left: Array) -> Array:
+    """(2,) by how much a part of the image that moves by itself, and was not found to, may pull the shift; 0 where none
+    is seen.
+
+    The scores (tiles, 2) that shift and shear have ``left`` are those of noise where all moves alike. Squares of tiles
+    whose scores add up to more than chance may move by themselves. Without one of them, the shift would be another one,
+    by the pull at most.
+    """
+    rows, cols = len(comparison.window.y), len(comparison.window.x)
+    elements = [
+        matrices.reshape(-1, 4)[:, [0, 1, 3]]
+        for matrices in (_expect_variances(comparison), _tile_information(comparison))
+    ]
+    planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
+    whole = comparison.fit.information
+    least, most, excess = np.linalg.inv(whole), 0.0, 1.0
+    found = np.zeros(2)
+    for side in _PULL_SIDES:
+        if side > min(rows, cols):
+            break
+        chi2, sums = _chi_squares(planes, side)
+        if side == _PULL_SIDES[0]:
+            # Images are never quite alike: as the least squares scatter, so do larger ones.
+            scatter = float(np.median(np.append(chi2[chi2 > 0.0], 0.0))) / _MEDIAN_CHI2
+            excess = float(np.clip(scatter, 1.0, _MOST_EXCESS))
+        moves = sums[chi2 > _PULL_CHI2 * excess]
+        rest = whole - moves[:, [5, 6, 6, 7]].reshape(-1, 2, 2)
+        kept = np.einsum("ij,nij->n", least, rest) > 2.0 * _LEAST_REST
+        if not np.any(kept):
+            continue
+        pulls = np.linalg.solve(rest[kept], moves[kept, :2, None])[..., 0]
+        sizes = np.einsum("ni,ij,nj->n", pulls, whole, pulls)
+        if sizes.max() > most:
+            most, found = float(sizes.max()), pulls[int(np.argmax(sizes))]
+    return np.asarray(found)
+
+
+def _chi_squares(planes: Array, side: int) -> tuple[Array, Array]:
+    """(rows, cols) squares of the sums of scores over squares of tiles in units of their variances, and the sums."""
+    sums = np.asarray(
+        cv2.boxFilter(planes, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    )
+    x, y, xx, xy, yy = np.moveaxis(sums[..., :5], -1, 0)
+    determinant = xx * yy - xy**2
+    # Of what the filter adds up and takes off again, rounding is left where there is nothing.
+    least = _ROUNDING * float(xx.max()) * float(yy.max())
+    good = determinant > np.maximum(_ROUNDING * xx * yy, least)
+    chi2 = (yy * x**2 - 2.0 * xy * x * y + xx * y**2) / np.where(good, determinant, 1.0)
+    return np.where(good, chi2, 0.0), sums
 
 
 def _well_conditioned(matrix: Array) -> bool:

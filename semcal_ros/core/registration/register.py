@@ -615,6 +615,8 @@ def _register(
     elif kept is None and whole is not None and whole.share < _MUCH_AGREES:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
+    if rejection is None:
+        alignment, rejection = _allow_for_pull(alignment, reference.settings.max_sigma_px)
     moved = replace(
         alignment,
         shift_px=alignment.shift_px + origin,
@@ -632,6 +634,22 @@ def _register(
         _middle_px=middle.astype(np.float64),
         _origin_px=origin,
     )
+
+
+def _allow_for_pull(
+    alignment: Alignment, most_px: float
+) -> tuple[Alignment, Rejection[MatchFailure] | None]:
+    """The alignment with a covariance that has what a part which may move by itself pulls; a rejection where that is
+    more than ``most_px``.
+    """
+    pulled = alignment.with_pull()
+    sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(pulled.covariance))))
+    if sigma <= most_px:
+        return pulled, None
+    reason = (
+        f"ambiguous: without a part of the structure, the shift is another one by {sigma:.1f} px"
+    )
+    return pulled, Rejection(MatchFailure.AMBIGUOUS, reason)
 
 
 def _align_at_finest(
