@@ -84,7 +84,7 @@ _MAX_COARSE_PASSES = 4
 # The number of scores that count is itself uncertain where it is small.
 _LEAST_FREEDOM = 8.0
 # Fewer than this make up most of the information only where it lies in lone particles.
-_FEW_SCORES = 12.0
+_FEW_SCORES = 40.0
 # Then the covariance that the residuals of the pixels lead to counts as that of so many scores: what moves a particle
 # as a whole, such as a change of its shape, is seen by the scatter of the scores alone.
 _EXPECTED_SCORES = 6.0
@@ -119,7 +119,7 @@ _MIN_SHEAR_ROWS = 6
 _ROWS_PER_MODE = 1.5
 # Sides of the squares of tiles that may move by themselves, and the chi-square (2 degrees of freedom) from which one
 # seems to: of some 500 independent squares, one in 20 images, in which it widens the covariance by little.
-_PULL_SIDES, _PULL_CHI2 = (2, 3, 4, 6, 8, 11, 16), 18.4
+_PULL_SIDES, _PULL_CHI2 = (2, 3, 4, 6, 8, 11), 18.4
 # The median of a chi-square, by how many times that the squares scatter where the images differ all over, as by
 # charging; more than that is that of motions. Part of the largest variance that is rounding.
 _MEDIAN_CHI2, _MOST_EXCESS, _ROUNDING = 1.386, 3.0, 1e-6
@@ -809,7 +809,8 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     least, most, excess = np.linalg.inv(whole), 0.0, 1.0
     found = np.zeros(2)
     for side in _PULL_SIDES:
-        if side > min(rows, cols):
+        if 2 * side > min(rows, cols) and side > _PULL_SIDES[0]:
+            # Of a specimen that turns, the halves differ.
             break
         chi2, sums = _chi_squares(planes, side)
         if side == _PULL_SIDES[0]:

@@ -269,14 +269,14 @@ def _partly_moved(by_px: float, seed: int) -> Registration:
 
 
 def test_what_moves_by_itself_and_is_not_found_is_in_the_sigma() -> None:
-    # The pull is up to a quarter of the motion; the same noise without it has a sigma of 0.01 px.
+    # The pull is up to a quarter of the motion, six times the sigma of the noise. A square shows a third of the strip.
     pulled = [_partly_moved(0.14, seed) for seed in range(12)]
     assert all(found.accepted and found.moving is None for found in pulled)
     errors = np.array([found.shift_px[0] - 0.3 for found in pulled])
     sigmas = np.array([np.sqrt(found.covariance[0, 0]) for found in pulled])
     plain = np.mean([np.sqrt(_partly_moved(0.0, seed).covariance[0, 0]) for seed in range(12)])
-    assert abs(errors.mean()) > 2.0 * plain
-    assert np.sqrt(np.mean((errors / sigmas) ** 2)) < 1.7
+    assert abs(errors.mean()) > 5.0 * plain
+    assert np.sqrt(np.mean((errors / sigmas) ** 2)) < 2.5
     # Across, where nothing pulls, the sigma is that of the noise.
     across = np.mean([np.sqrt(found.covariance[1, 1]) for found in pulled])
     assert across < 1.5 * plain
