@@ -805,42 +805,41 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
         for matrices in (_expect_variances(comparison), _tile_information(comparison))
     ]
     planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
+    # Of a specimen that turns, the halves differ.
+    sides = [n for n in _PULL_SIDES if 2 * n <= min(rows, cols)] or [_PULL_SIDES[0]]
+    squares = [
+        cv2.boxFilter(planes, -1, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for n in sides
+    ]
+    sums = np.moveaxis(np.array(squares), -1, 0).reshape(8, len(sides), -1)
+    chi2 = _chi_squares(np.ascontiguousarray(sums[:5]))
+    # Images are never quite alike: as the least squares scatter, so do larger ones.
+    least = chi2[0][chi2[0] > 0.0]
+    scatter = float(np.median(least)) / _MEDIAN_CHI2 if least.size else 1.0
+    moves = sums[:, chi2 > _PULL_CHI2 * min(max(scatter, 1.0), _MOST_EXCESS)].T
+    if not len(moves):
+        return np.zeros(2)
     whole = comparison.fit.information
-    least, most, excess = np.linalg.inv(whole), 0.0, 1.0
-    found = np.zeros(2)
-    for side in _PULL_SIDES:
-        if 2 * side > min(rows, cols) and side > _PULL_SIDES[0]:
-            # Of a specimen that turns, the halves differ.
-            break
-        chi2, sums = _chi_squares(planes, side)
-        if side == _PULL_SIDES[0]:
-            # Images are never quite alike: as the least squares scatter, so do larger ones.
-            scatter = float(np.median(np.append(chi2[chi2 > 0.0], 0.0))) / _MEDIAN_CHI2
-            excess = float(np.clip(scatter, 1.0, _MOST_EXCESS))
-        moves = sums[chi2 > _PULL_CHI2 * excess]
-        rest = whole - moves[:, [5, 6, 6, 7]].reshape(-1, 2, 2)
-        kept = np.einsum("ij,nij->n", least, rest) > 2.0 * _LEAST_REST
-        if not np.any(kept):
-            continue
-        pulls = np.linalg.solve(rest[kept], moves[kept, :2, None])[..., 0]
-        sizes = np.einsum("ni,ij,nj->n", pulls, whole, pulls)
-        if sizes.max() > most:
-            most, found = float(sizes.max()), pulls[int(np.argmax(sizes))]
-    return np.asarray(found)
+    rest = whole - moves[:, [5, 6, 6, 7]].reshape(-1, 2, 2)
+    share = 0.5 * np.einsum("ij,nij->n", invert_symmetric(whole), rest)
+    found = share > _LEAST_REST
+    if not np.any(found):
+        return np.zeros(2)
+    pulls = np.linalg.solve(rest[found], moves[found, :2, None])[..., 0]
+    return np.asarray(pulls[int(np.argmax(np.einsum("ni,ij,nj->n", pulls, whole, pulls)))])
 
 
-def _chi_squares(planes: Array, side: int) -> tuple[Array, Array]:
-    """(rows, cols) squares of the sums of scores over squares of tiles in units of their variances, and the sums."""
-    sums = np.asarray(
-        cv2.boxFilter(planes, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    )
-    x, y, xx, xy, yy = np.moveaxis(sums[..., :5], -1, 0)
+def _chi_squares(sums: Array) -> Array:
+    """(sides, n) squares of sums of scores over n squares of tiles in units of their variances; ``sums`` (5, sides, n)
+    are those of the scores and of the elements xx, xy and yy of their variances.
+    """
+    x, y, xx, xy, yy = sums
     determinant = xx * yy - xy**2
     # Of what the filter adds up and takes off again, rounding is left where there is nothing.
-    least = _ROUNDING * float(xx.max()) * float(yy.max())
+    least = _ROUNDING * (xx.max(axis=1) * yy.max(axis=1))[:, None]
     good = determinant > np.maximum(_ROUNDING * xx * yy, least)
     chi2 = (yy * x**2 - 2.0 * xy * x * y + xx * y**2) / np.where(good, determinant, 1.0)
-    return np.where(good, chi2, 0.0), sums
+    return np.where(good, chi2, 0.0)
 
 
 def _well_conditioned(matrix: Array) -> bool:
