@@ -45,7 +45,11 @@ from semcal_ros.core.drift.estimates import (
     forget_prior,
 )
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.fixed_parts import LEAST_MOVE_PX, find_fixed_parts
+from semcal_ros.core.drift.fixed_parts import (
+    LEAST_MOVE_PX,
+    find_fixed_parts,
+    share_of_gradients,
+)
 from semcal_ros.core.drift.flicker import FlickerEstimator
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.gating import (
@@ -425,8 +429,9 @@ class DriftTracker:
                 fixed.mask = found.stays | (known & ~found.moves)
                 is_new = float(np.mean(found.stays & ~known)) > _NEWLY_FIXED
                 if is_new:
-                    # What stays pulls to where it is: by the whole of the motion at most.
-                    moved = np.linalg.solve(frame.px_from_unit, moved_px)
+                    # What stays pulls to where it is: by its part of the structure.
+                    pulled_px = share_of_gradients(pixels, found.stays) * moved_px
+                    moved = np.linalg.solve(frame.px_from_unit, pulled_px)
                     track.filter.widen_measurements(np.outer(moved, moved))
                     self._clean_keyframes(track)
         elif fixed.mask is not None and fixed.mask.shape != pixels.shape[:2]:
