@@ -30,7 +30,7 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
 from semcal_ros.core.registration.agreement import keep_bodies
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 
-__all__ = ["LEAST_MOVE_PX", "FixedParts", "find_fixed_parts"]
+__all__ = ["LEAST_MOVE_PX", "FixedParts", "find_fixed_parts", "share_of_gradients"]
 
 
 #: Drift from which on two images are compared: less of it hardly changes a picture with details of some pixels.
@@ -45,6 +45,8 @@ _ROUNDING = 1.0 / 6.0
 _MOST_STAYS = 0.3
 # By how much what stays is enlarged: its soft edge is told by less than its inside.
 _ENLARGED_PX = 2
+# Smoothing before gradients are summed, px, and what is allowed for the noise that is left.
+_SMOOTHED_PX, _ALLOWED = 1.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,21 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
         return None
     enlarged = grow_mask(stays, _ENLARGED_PX)
     return FixedParts(enlarged, np.asarray(moves & ~enlarged))
+
+
+def share_of_gradients(image: AnyImage, part: Mask) -> float:
+    """The part of the squared gradients of an image (h, w) or (h, w, 3) that lies in ``part`` (h, w), 0 to 1.
+
+    A shift is pulled to that of the part by as much of the difference. The image is smoothed against noise, which has
+    gradients, too; those that are left are allowed for by a factor of two.
+    """
+    smoothed = cv2.GaussianBlur(_to_levels(image), (0, 0), _SMOOTHED_PX)
+    squares = (
+        cv2.Sobel(smoothed, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(smoothed, cv2.CV_32F, 0, 1) ** 2
+    )
+    whole = float(np.sum(squares, dtype=np.float64))
+    inside = float(np.sum(squares[part], dtype=np.float64))
+    return min(1.0, _ALLOWED * inside / max(whole, 1e-30))
 
 
 def _to_levels(image: AnyImage) -> Image:

@@ -45,7 +45,11 @@ from semcal_ros.core.drift.estimates import (
     forget_prior,
 )
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.fixed_parts import LEAST_MOVE_PX, find_fixed_parts
+from semcal_ros.core.drift.fixed_parts import (
+    LEAST_MOVE_PX,
+    find_fixed_parts,
+    share_of_gradients,
+)
 from semcal_ros.core.drift.flicker import FlickerEstimator
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.gating import (
@@ -102,6 +106,8 @@ _MIN_MERGE_CORRELATION, _MERGE_GAINS, _MAX_MERGE_SHEAR_PX = 0.85, (0.5, 2.0), 0.
 # Standard deviations of a measured shear within which it may be none, and the largest one then: a quarter of a pixel to
 # either side at the upper and the lower edge blurs structure at a third of a cycle per pixel by 4 % there.
 _OPEN_SIGMAS, _MAX_BLUR_PX = 2.0, 0.5
+# 1-sigma of a shift from which a frame would blur the mean as much.
+_MAX_PLACE_PX = 0.2
 # A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
 # noise weighs otherwise than as an image, and other parts of it are compared. Of the variance of the
 # frame's noise, this part, and this part times the fraction that did not overlap, as seen in the
@@ -423,8 +429,9 @@ class DriftTracker:
                 fixed.mask = found.stays | (known & ~found.moves)
                 is_new = float(np.mean(found.stays & ~known)) > _NEWLY_FIXED
                 if is_new:
-                    # What stays pulls to where it is: by the whole of the motion at most.
-                    moved = np.linalg.solve(frame.px_from_unit, moved_px)
+                    # What stays pulls to where it is: by its part of the structure.
+                    pulled_px = share_of_gradients(pixels, found.stays) * moved_px
+                    moved = np.linalg.solve(frame.px_from_unit, pulled_px)
                     track.filter.widen_measurements(np.outer(moved, moved))
                     self._clean_keyframes(track)
         elif fixed.mask is not None and fixed.mask.shape != pixels.shape[:2]:
@@ -990,6 +997,7 @@ def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
         and _MERGE_GAINS[0] < registration.contrast < _MERGE_GAINS[1]
         and not np.any(shows_shear)
         and float(np.max(shear_px)) < _MAX_BLUR_PX
+        and float(np.max(np.diag(registration.covariance))) < _MAX_PLACE_PX**2
     )
 
 

@@ -36,9 +36,10 @@ changes along the rows, which were scanned in an instant.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from scipy.special import stdtrit
 
@@ -83,7 +84,7 @@ _MAX_COARSE_PASSES = 4
 # The number of scores that count is itself uncertain where it is small.
 _LEAST_FREEDOM = 8.0
 # Fewer than this make up most of the information only where it lies in lone particles.
-_FEW_SCORES = 12.0
+_FEW_SCORES = 40.0
 # Then the covariance that the residuals of the pixels lead to counts as that of so many scores: what moves a particle
 # as a whole, such as a change of its shape, is seen by the scatter of the scores alone.
 _EXPECTED_SCORES = 6.0
@@ -116,6 +117,14 @@ _MIN_BLOCKS = 36
 _MIN_SHEAR_ROWS = 6
 # Rows of tiles per cosine mode down the frame: the higher ones are of rows that share smoothed noise.
 _ROWS_PER_MODE = 1.5
+# Sides of the squares of tiles that may move by themselves, and the chi-square (2 degrees of freedom) from which one
+# seems to: of some 500 independent squares, one in 20 images, in which it widens the covariance by little.
+_PULL_SIDES, _PULL_CHI2 = (2, 3, 4, 6, 8, 11), 18.4
+# The median of a chi-square, by how many times that the squares scatter where the images differ all over, as by
+# charging; more than that is that of motions. Part of the largest variance that is rounding.
+_MEDIAN_CHI2, _MOST_EXCESS, _ROUNDING = 1.386, 3.0, 1e-6
+# Part of the information that must be elsewhere: the specimen is no smaller part.
+_LEAST_REST = 0.3
 # A shear whose scaled information matrix has a larger condition number is not determined.
 _MAX_CONDITION = 1e6
 # Noise of lines is looked for from this number of rows of tiles on, and found where it makes the
@@ -203,6 +212,22 @@ class Alignment:
     converged: bool
     iterations: int
     _comparison: _Comparison | None = field(default=None, repr=False, compare=False)
+    _left: Array | None = field(default=None, repr=False, compare=False)
+
+    def with_pull(self) -> Alignment:
+        """The same with what a part of the image that moves by itself, and was not found to, may pull, in the
+        covariance.
+        """
+        if self._comparison is None or self._left is None:
+            return self
+        pull = _find_pull(self._comparison, self._left) * self._comparison.level.factor
+        if not np.any(pull):
+            return self
+        joint = self.joint_covariance.copy()
+        joint[:2, :2] += np.outer(pull, pull)
+        return replace(
+            self, covariance=self.covariance + np.outer(pull, pull), joint_covariance=joint
+        )
 
     def fit_similarity(self) -> SimilarityFit | None:
         """Estimate a rotation and a scale, too; None where too few tiles are compared."""
@@ -628,14 +653,19 @@ def _expect_spread(comparison: _Comparison, powers: Array) -> Array:
     A tile has some hundred pixels, and only two scores: of a few tiles it is the better estimate. It does not see what
     moves a tile as a whole.
     """
+    both = np.einsum("tp,tq,tij->piqj", powers, powers, _expect_variances(comparison))
+    return np.asarray(both.reshape(2 * powers.shape[1], -1))
+
+
+def _expect_variances(comparison: _Comparison) -> Array:
+    """(tiles, 2, 2) covariance of each tile's score as the residuals of its pixels tell it."""
     tiles, level, window = _measure_tiles(comparison), comparison.level, comparison.window
     residual = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
     counts = level.pixel_counts[window.rows, window.cols]
     weights = comparison.geometry.normal_matrices[:, 3, 3] / counts.ravel()
     products = level.noise_products[window.rows, window.cols].reshape(-1, 2, 2)
     variances = weights**2 * np.maximum(residual / counts, 0.0).ravel()
-    both = np.einsum("tp,tq,t,tij->piqj", powers, powers, variances, products)
-    return np.asarray(both.reshape(2 * powers.shape[1], -1))
+    return np.asarray(variances[:, None, None] * products)
 
 
 def _widen_few(count: float, estimated: int, blocks: int) -> float:
@@ -659,7 +689,7 @@ def _summarise(
     gain = float(fit.gain[0])
     weights = _tile_information(comparison)
     difference, variance = _compare_halves(comparison, covariance, weights)
-    joint, joint_covariance = _fit_shear(comparison, weights)
+    joint, joint_covariance, left = _fit_shear(comparison, weights)
     factor = level.factor
     return Alignment(
         shift_px=comparison.improved * factor,
@@ -679,6 +709,7 @@ def _summarise(
         converged=converged,
         iterations=passes,
         _comparison=comparison,
+        _left=left,
     )
 
 
@@ -732,8 +763,10 @@ def _compare_halves(
     return difference, variance
 
 
-def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
-    """(4,) shift of the image's middle row and shear, estimated together, and their covariance."""
+def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, Array]:
+    """(4,) shift of the image's middle row and shear, estimated together, their covariance, and the scores (tiles, 2)
+    that they leave.
+    """
     rows, cols = len(comparison.window.y), len(comparison.window.x)
     # The shift is the same for all tiles of a row.
     by_row = np.add.reduce(weights.reshape(rows, cols, 2, 2), axis=1)
@@ -743,7 +776,7 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scaled, scale = equilibrate(information)
     if rows < _MIN_SHEAR_ROWS or not _well_conditioned(scaled):
-        return np.full(4, np.nan), np.full((4, 4), np.inf)
+        return np.full(4, np.nan), np.full((4, 4), np.inf), comparison.fit.scores
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = comparison.fit.scores.reshape(rows, cols, 2)
     step = -inverse @ (powers.T @ np.add.reduce(scores, axis=1)).ravel()
@@ -754,7 +787,59 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array]:
     residual = scores + explained[..., 0]
     tilted = np.concatenate([residual, powers[:, 1, None, None] * residual], axis=2)
     each = np.repeat(powers, cols, axis=0)
-    return joint, _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
+    covariance = _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
+    return joint, covariance, residual.reshape(-1, 2)
+
+
+def _find_pull(comparison: _Comparison, left: Array) -> Array:
+    """(2,) by how much a part of the image that moves by itself, and was not found to, may pull the shift; 0 where none
+    is seen.
+
+    The scores (tiles, 2) that shift and shear have ``left`` are those of noise where all moves alike. Squares of tiles
+    whose scores add up to more than chance may move by themselves. Without one of them, the shift would be another one,
+    by the pull at most.
+    """
+    rows, cols = len(comparison.window.y), len(comparison.window.x)
+    elements = [
+        matrices.reshape(-1, 4)[:, [0, 1, 3]]
+        for matrices in (_expect_variances(comparison), _tile_information(comparison))
+    ]
+    planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
+    # Of a specimen that turns, the halves differ.
+    sides = [n for n in _PULL_SIDES if 2 * n <= min(rows, cols)] or [_PULL_SIDES[0]]
+    squares = [
+        cv2.boxFilter(planes, -1, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for n in sides
+    ]
+    sums = np.moveaxis(np.array(squares), -1, 0).reshape(8, len(sides), -1)
+    chi2 = _chi_squares(np.ascontiguousarray(sums[:5]))
+    # Images are never quite alike: as the least squares scatter, so do larger ones.
+    least = chi2[0][chi2[0] > 0.0]
+    scatter = float(np.median(least)) / _MEDIAN_CHI2 if least.size else 1.0
+    moves = sums[:, chi2 > _PULL_CHI2 * min(max(scatter, 1.0), _MOST_EXCESS)].T
+    if not len(moves):
+        return np.zeros(2)
+    whole = comparison.fit.information
+    rest = whole - moves[:, [5, 6, 6, 7]].reshape(-1, 2, 2)
+    share = 0.5 * np.einsum("ij,nij->n", invert_symmetric(whole), rest)
+    found = share > _LEAST_REST
+    if not np.any(found):
+        return np.zeros(2)
+    pulls = np.linalg.solve(rest[found], moves[found, :2, None])[..., 0]
+    return np.asarray(pulls[int(np.argmax(np.einsum("ni,ij,nj->n", pulls, whole, pulls)))])
+
+
+def _chi_squares(sums: Array) -> Array:
+    """(sides, n) squares of sums of scores over n squares of tiles in units of their variances; ``sums`` (5, sides, n)
+    are those of the scores and of the elements xx, xy and yy of their variances.
+    """
+    x, y, xx, xy, yy = sums
+    determinant = xx * yy - xy**2
+    # Of what the filter adds up and takes off again, rounding is left where there is nothing.
+    least = _ROUNDING * (xx.max(axis=1) * yy.max(axis=1))[:, None]
+    good = determinant > np.maximum(_ROUNDING * xx * yy, least)
+    chi2 = (yy * x**2 - 2.0 * xy * x * y + xx * y**2) / np.where(good, determinant, 1.0)
+    return np.where(good, chi2, 0.0)
 
 
 def _well_conditioned(matrix: Array) -> bool:

@@ -108,6 +108,9 @@ _MOST_DROPPED, _DROPPED_WITHIN_PX = 3, 1.0
 # Less than this of the structure agrees where images are of two motions, though no part was found to be one.
 _MUCH_AGREES = 0.85
 
+# A part that may pull by more is another motion, and not one that was not found.
+_MOST_PULL_PX = 2.0
+
 # How an image appears that fits part by part, but not by one shift. (That its halves disagree says it already.)
 _SIGNS_OF_DEFORMATION = frozenset(
     {
@@ -615,6 +618,8 @@ def _register(
     elif kept is None and whole is not None and whole.share < _MUCH_AGREES:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
+    if rejection is None:
+        alignment, rejection = _allow_for_pull(alignment)
     moved = replace(
         alignment,
         shift_px=alignment.shift_px + origin,
@@ -632,6 +637,22 @@ def _register(
         _middle_px=middle.astype(np.float64),
         _origin_px=origin,
     )
+
+
+def _allow_for_pull(
+    alignment: Alignment,
+) -> tuple[Alignment, Rejection[MatchFailure] | None]:
+    """The alignment with a covariance that has what a part which may move by itself pulls; a rejection where that is
+    too much.
+    """
+    pulled = alignment.with_pull()
+    sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(pulled.covariance))))
+    if sigma <= _MOST_PULL_PX:
+        return pulled, None
+    reason = (
+        f"ambiguous: without a part of the structure, the shift is another one by {sigma:.1f} px"
+    )
+    return pulled, Rejection(MatchFailure.AMBIGUOUS, reason)
 
 
 def _align_at_finest(

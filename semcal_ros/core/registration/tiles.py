@@ -112,6 +112,8 @@ class PyramidLevel:
     products: Image
     normal_matrices: Array
     dropped: Mask | None = None
+    #: The level of which they were dropped.
+    undropped: PyramidLevel | None = field(default=None, repr=False, compare=False)
     #: Geometry of the latest windows, by their keys.
     geometries: LruCache[tuple[int, int, int, int], TileGeometry] = field(
         default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
@@ -137,17 +139,23 @@ class PyramidLevel:
 
         Noise n = G w of white noise w, smoothed by G, has the product g' n = (G g)' w with a gradient g.
         """
+        if self.undropped is not None:
+            # In the proportion of the gradients that count: a mask of each frame would be smoothed anew.
+            whole = self.undropped
+            energies = [
+                np.einsum("rcii->rc", level.normal_matrices[..., :2, :2]) for level in (self, whole)
+            ]
+            share = energies[0] / np.maximum(energies[1], 1e-30)
+            return np.asarray(whole.noise_products * share[..., None, None])
         rows, cols = self.products.shape[:2]
         side_x, side_y = self.side
-        kept = self.products[:, :, :2]
-        if self.dropped is not None:
-            kept = kept * ~self.dropped[:, :, None, :]
-        planes = kept.reshape(rows, cols, 2, side_y, side_x).transpose(2, 0, 3, 1, 4)
-        planes = planes.reshape(2, rows * side_y, cols * side_x)
+        planes = self.products[:, :, :2].reshape(rows, cols, 2, side_y, side_x)
+        planes = planes.transpose(2, 0, 3, 1, 4).reshape(2, rows * side_y, cols * side_x)
         smoothed = np.stack([smooth(plane, self.sigma_px) for plane in planes])
         tiles = smoothed.reshape(2, rows, side_y, cols, side_x).transpose(1, 3, 0, 2, 4)
-        tiles = tiles.reshape(rows, cols, 2, -1).astype(np.float64)
-        return np.asarray(tiles @ tiles.transpose(0, 1, 3, 2)) / passed_variance(self.sigma_px)
+        tiles = np.ascontiguousarray(tiles).reshape(rows, cols, 2, -1)
+        products = (tiles @ tiles.transpose(0, 1, 3, 2)).astype(np.float64)
+        return np.asarray(products / passed_variance(self.sigma_px))
 
 
 @dataclass(frozen=True)
@@ -297,6 +305,7 @@ def drop_pixels(level: PyramidLevel, dropped: Mask) -> PyramidLevel:
         level,
         normal_matrices=normal_matrices,
         dropped=tiles,
+        undropped=level,
         geometries=LruCache(_KEPT_WINDOWS),
     )
 

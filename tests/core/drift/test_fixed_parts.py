@@ -22,7 +22,11 @@ from numpy.typing import NDArray
 
 from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.arrays import Mask
-from semcal_ros.core.drift.fixed_parts import LEAST_MOVE_PX, find_fixed_parts
+from semcal_ros.core.drift.fixed_parts import (
+    LEAST_MOVE_PX,
+    find_fixed_parts,
+    share_of_gradients,
+)
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.drift_scenes import Texture
 
@@ -131,3 +135,15 @@ def test_contrast_of_a_mean_does_not_grow() -> None:
     truth = brought[bright].mean() - np.median(brought)
     # Without care each mean had more contrast than the one before: 1.3 times as much here.
     assert part[bright].mean() - np.median(part) == pytest.approx(truth, rel=0.06)
+
+
+def test_what_stays_pulls_by_its_part_of_the_gradients() -> None:
+    # The same texture everywhere: a tenth of the area has a tenth of the gradients, twice that is allowed for.
+    plain, tenth = picture((0.0, 0.0), 0, burnt=False), np.zeros((SIZE, SIZE), dtype=bool)
+    tenth[:, : SIZE // 10] = True
+    assert share_of_gradients(plain, tenth) == pytest.approx(0.2, rel=0.3)
+    assert share_of_gradients(plain, ~tenth) == 1.0
+    # A smooth part, whatever its area, pulls nothing.
+    smooth = plain.copy()
+    smooth[:, : SIZE // 10] = 110
+    assert share_of_gradients(smooth, tenth & np.roll(tenth, -8, axis=1)) < 0.01

@@ -260,6 +260,38 @@ def test_refuses_when_halves_move_differently() -> None:
     _refused(register_pair(reference, image), "disagree")
 
 
+def _partly_moved(by_px: float, seed: int) -> Registration:
+    """A picture whose left quarter moves by so much, less than is found to be a motion of its own."""
+    reference, image = _pair((0.3, -0.2), 6.0, seed)
+    part = noisy(TEXTURE.view((0.3 + by_px, -0.2), SIZE), 6.0, 2 * seed + 1)
+    image[:, : SIZE // 4] = part[:, : SIZE // 4]
+    return register_pair(reference, image)
+
+
+def test_what_moves_by_itself_and_is_not_found_is_in_the_sigma() -> None:
+    # The pull is up to a quarter of the motion, six times the sigma of the noise. A square shows a third of the strip.
+    pulled = [_partly_moved(0.14, seed) for seed in range(12)]
+    assert all(found.accepted and found.moving is None for found in pulled)
+    errors = np.array([found.shift_px[0] - 0.3 for found in pulled])
+    sigmas = np.array([np.sqrt(found.covariance[0, 0]) for found in pulled])
+    plain = np.mean([np.sqrt(_partly_moved(0.0, seed).covariance[0, 0]) for seed in range(12)])
+    assert abs(errors.mean()) > 5.0 * plain
+    assert np.sqrt(np.mean((errors / sigmas) ** 2)) < 2.5
+    # Across, where nothing pulls, the sigma is that of the noise.
+    across = np.mean([np.sqrt(found.covariance[1, 1]) for found in pulled])
+    assert across < 1.5 * plain
+
+
+def test_where_all_moves_alike_chance_is_seldom_taken_for_a_pull() -> None:
+    found = [register_pair(*_pair((0.3, -0.2), 6.0, seed)).alignment for seed in range(40)]
+    # What is found once is found, and added, again.
+    widened = [
+        alignment.with_pull().covariance[0, 0] > alignment.covariance[0, 0] for alignment in found
+    ]
+    # Stated: one image in 20; more than six of 40 come by chance once in 100.
+    assert np.count_nonzero(widened) <= 6
+
+
 def test_refuses_a_moving_picture_under_a_fixed_pattern() -> None:
     # Such as contamination on the detector: two shifts are equally true.
     fixed = 40.0 * Texture(9).view((0.0, 0.0), SIZE)
