@@ -23,6 +23,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    SMOOTH,
     SMOOTH_AT_LAST,
     Adjustment,
     refine,
@@ -203,7 +204,8 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         adjustment.functions,
         adjustment.result.state,
         spread,
-        always=SMOOTH_AT_LAST,
+        # A field takes the place of what is not there.
+        always=SMOOTH_AT_LAST if field is None else SMOOTH,
         choose_terms=field is None,
     )
     adjustment = _adjust_exactly(final, adjustment)

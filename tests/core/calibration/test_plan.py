@@ -68,11 +68,11 @@ def test_the_plan_predicts_what_its_views_bring(poor: CalibrationModel) -> None:
     after = followed(poor, tuple(visit.magnification for visit in planned.visits), 77)
     # Other tilts and corners than those of the plan, but as many.
     assert worst(after) == pytest.approx(planned.visits[-1].largest, rel=0.15)
-    # Without a plan: visits where the calibration is as poor, at random.
+    # Without a plan: visits where the calibration is as poor, at random. None of three is as good.
     rng = np.random.default_rng(3)
     random = np.exp(rng.uniform(np.log(100.0), np.log(10000.0), (3, 4)))
     others = [worst(followed(poor, tuple(own), 100 + k)) for k, own in enumerate(random)]
-    assert worst(after) < 0.7 * np.median(others)
+    assert worst(after) < 0.95 * min(others)
 
 
 def test_the_plan_allows_for_what_may_change_until_then(poor: CalibrationModel) -> None:
