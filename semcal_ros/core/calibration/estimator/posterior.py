@@ -22,7 +22,7 @@ the residuals between lines, which is estimated from their products.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,7 @@ from scipy.optimize import nnls
 from semcal_ros.core.arrays import Array, Indices, equilibrate, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    SMOOTH,
     SMOOTH_AT_LAST,
     Adjustment,
     BundleResult,
@@ -318,7 +319,9 @@ class PaddedAdjustment:
 
 def pad(setup: Setup, adjustment: Adjustment) -> PaddedAdjustment:
     """Return the adjustment with a few more coefficients; ``setup`` has the views that it was made of."""
-    functions = _pad_functions(adjustment.functions)
+    # What a further term may do besides is a residual field's, where there is one.
+    names = SMOOTH if setup.corrected else SMOOTH_AT_LAST
+    functions = _pad_functions(adjustment.functions, names)
     problem = build_problem(setup, functions, setup.views, adjustment.spread)
     state = adjustment.result.state
     state = replace(state, theta=stack_theta(setup, functions, state))
@@ -330,10 +333,10 @@ def pad(setup: Setup, adjustment: Adjustment) -> PaddedAdjustment:
     return PaddedAdjustment(adjustment, functions, problem, result, jitter, lines)
 
 
-def _pad_functions(functions: Functions) -> dict[str, ContinuousFunction]:
+def _pad_functions(functions: Functions, names: Sequence[str]) -> dict[str, ContinuousFunction]:
     out = dict(functions)
     low, high = functions["scale"].g_range
-    for name in SMOOTH_AT_LAST if low < high else ():
+    for name in names if low < high else ():
         if name not in functions:
             continue
         own = functions[name]
