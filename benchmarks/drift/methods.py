@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.drift.pairs import Array, Gray, Pair
+from semcal_ros.core.registration.reference import Reference
 from semcal_ros.core.registration.register import (
-    Reference,
     Registration,
     prepare_reference,
     register,

@@ -40,7 +40,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.table import show
-from semcal_ros.core.drift.tracker import DriftTracker, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftUpdate
+from semcal_ros.core.drift.tracker import DriftTracker
 
 SIZE, TORUS, FRAMES = 384, 640, 30
 WRONG_PX, WRONG_SIGMAS, LEAST_TRACKED = 0.1, 3.0, 0.95

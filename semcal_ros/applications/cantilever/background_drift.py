@@ -58,12 +58,8 @@ from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
-from semcal_ros.core.registration.register import (
-    Region,
-    RegistrationSettings,
-    prepare_reference,
-    register,
-)
+from semcal_ros.core.registration.reference import Region, RegistrationSettings
+from semcal_ros.core.registration.register import prepare_reference, register
 from semcal_ros.core.wording import omit_numbers
 
 

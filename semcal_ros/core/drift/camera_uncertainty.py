@@ -21,15 +21,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
-__all__ = [
-    "apparent_zoom_shift",
-    "centre_covariance",
-    "relative_scale_sigma",
-    "scale_covariance",
-    "zoom_covariance",
-]
-
-
 # Places of the parameters in ScanCamera.covariance.
 _SCALES, _CENTRE = slice(0, 3), slice(3, 5)
 

@@ -38,16 +38,6 @@ from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.core.wording import omit_numbers
 
-__all__ = [
-    "DriftEstimate",
-    "DriftPath",
-    "DriftPredictor",
-    "DriftSettings",
-    "DriftStatus",
-    "DriftUpdate",
-    "forget_prior",
-]
-
 
 @dataclass(frozen=True)
 class DriftSettings:

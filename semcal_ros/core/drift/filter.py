@@ -33,9 +33,6 @@ from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.smoother import Event, Mark, estimate_process_noise, replay
 from semcal_ros.core.drift.state import DriftState
 
-__all__ = ["DriftFilter"]
-
-
 # Logarithm by which the process noise changes with an innovation of one unit of excess: some five
 # frames are averaged.
 _ADAPTATION = 0.2

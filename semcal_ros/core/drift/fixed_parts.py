@@ -30,9 +30,6 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
 from semcal_ros.core.registration.agreement import keep_bodies
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 
-__all__ = ["LEAST_MOVE_PX", "FixedParts", "find_fixed_parts", "share_of_gradients"]
-
-
 #: Drift from which on two images are compared: less of it hardly changes a picture with details of some pixels.
 LEAST_MOVE_PX = 0.8
 # Side of the squares over which squared differences are summed, px, and by which factor one of the two sums must exceed

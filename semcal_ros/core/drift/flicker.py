@@ -37,9 +37,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.registration.register import Registration
 
-__all__ = ["FlickerEstimator"]
-
-
 # Modes that are used: the lowest after the line; 15 rows of tiles resolve them.
 _MODES = np.arange(2, 10)
 # Gains in twice the log likelihood (chi-square with 1 degree of freedom). Where the rows do not clearly move, by this

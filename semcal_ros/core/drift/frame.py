@@ -38,9 +38,6 @@ from semcal_ros.core.rectification.raw_positions import (
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.registration.reference import Region
 
-__all__ = ["MotionCorrector", "ScanFrame", "resampleable"]
-
-
 # Motions that displace pixels by less are left in a frame: a tenth of what registration resolves.
 _NEGLIGIBLE_PX = 1e-3
 # Cameras whose scanned region is remembered; a zoom passes through more, and comes back to few.

@@ -52,14 +52,6 @@ from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
 
-__all__ = [
-    "SHEAR_OF_SHIFT_DISTORTED",
-    "SHEAR_OF_SHIFT_RECTIFIED",
-    "FrameTimeEstimate",
-    "estimate_frame_time",
-]
-
-
 #: Shear per shift, 1-sigma, in images with their distortion, and where a calibration removed it: a
 #: distortion of 1 % at the edge of the field, and what is left of it.
 SHEAR_OF_SHIFT_DISTORTED, SHEAR_OF_SHIFT_RECTIFIED = 0.01, 0.001

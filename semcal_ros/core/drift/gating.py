@@ -25,17 +25,6 @@ from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 
-__all__ = [
-    "GATE",
-    "OutlierTest",
-    "inflate_after_pause",
-    "inflate_if_contradicted",
-    "inflate_position",
-    "inflate_when_lost",
-    "judge_shift",
-]
-
-
 #: Innovations beyond this normalised square occur in a correct filter once in a million frames
 #: (chi-square with 2 degrees of freedom).
 GATE = 27.6

@@ -29,8 +29,6 @@ from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["DriftHistory"]
-
 
 class DriftHistory:
     """The frames of a tracker, in stretches that each begin with zero drift."""

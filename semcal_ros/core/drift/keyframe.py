@@ -33,14 +33,6 @@ from semcal_ros.core.registration.fractional_delay import FINE, sample_shifted
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.register import Registration, prepare_reference, to_gray
 
-__all__ = [
-    "Keyframe",
-    "make_keyframe",
-    "resample_keyframe",
-    "scale_ratio",
-]
-
-
 # Fewer common rows or columns are not added to a mean.
 _MIN_COMMON_PX = 8
 # An image that shrinks by more than this must be blurred first, or it would alias: by a Gaussian

@@ -25,9 +25,6 @@ from semcal_ros.core.drift.keyframe import Keyframe, resample_keyframe, scale_ra
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.registration.reference import Reference, RegistrationSettings
 
-__all__ = ["MEAN_COUNTS", "SAME_SCALE", "Candidate", "KeyframeStore"]
-
-
 #: Ratio of two scales below which images need no resampling: 0.05 px at the edge of 1024 px.
 SAME_SCALE = 1.0001
 # An old keyframe must overlap by this much more than is asked of the one in use, or two of them

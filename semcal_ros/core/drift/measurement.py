@@ -31,16 +31,6 @@ from semcal_ros.core.drift.operations import CloneKeyframe, Measure
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.registration.register import Registration
 
-__all__ = [
-    "add_zoom_uncertainty",
-    "clone_keyframe",
-    "exceeds_tolerance",
-    "keyframe_noise",
-    "make_measurement",
-    "measure_itself",
-]
-
-
 # Errors that the scatter of the tiles does not show, 1-sigma: of a shift (interpolation), of a shear
 # (one linear step leads to it), and of a shear as a part of the shift (distortion; a calibration
 # whose scale is less certain leaves more).

@@ -30,19 +30,6 @@ from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import BASE_SIZE, KEYFRAME_SIZE, MOTION_SIZE, DriftState
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = [
-    "AddKeyframe",
-    "CloneKeyframe",
-    "CorrectShear",
-    "Inflate",
-    "Marginalise",
-    "Measure",
-    "MeasureOutcome",
-    "Operation",
-    "Predict",
-    "Transition",
-]
-
 
 @dataclass(frozen=True)
 class Transition:

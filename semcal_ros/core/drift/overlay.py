@@ -26,8 +26,6 @@ import numpy as np
 from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 
-__all__ = ["find_overlay", "remove_overlay"]
-
 # Windows (width, height), px, for text and for lines, in which pixels are counted that are the same in both pictures,
 # and by how many standard deviations of a binomial law there must be more than elsewhere: by chance, once in 10^9.
 _WINDOWS, _MORE_SIGMAS = ((9, 9), (21, 1), (1, 21)), 6.0

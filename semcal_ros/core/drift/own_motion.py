@@ -41,9 +41,6 @@ from semcal_ros.core.registration.reference import Region
 from semcal_ros.core.registration.register import to_gray
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel, drop_pixels, make_level
 
-__all__ = ["BodyFrame", "OwnMotion", "OwnMotionEstimator"]
-
-
 # By how much a body must have moved against the specimen, px, before its pixels are told from those of the ground;
 # frames after which a slower one is compared all the same, and frames without a measurement after each: it takes as
 # long as the drift of a frame without a tool.

@@ -27,9 +27,6 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 
-__all__ = ["ProcessNoise"]
-
-
 # The noise of a step is a Gauss-Legendre quadrature over the impulse responses; this order is exact
 # to rounding up to 4 time constants, and longer steps are made by doubling. Van Loan's matrix
 # exponential (1978, doi:10.1109/TAC.1978.1101743) needs exp(+dt / time constant) beside

@@ -68,8 +68,6 @@ from semcal_ros.core.registration.register import register_pair
 from semcal_ros.core.registration.tiles import Pyramid
 from semcal_ros.core.wording import counted
 
-__all__ = ["ScanPairDrift", "TurnedScan", "average_scans", "measure_scan_pairs"]
-
 # Sides of tiles, px: of those that are searched, which need enough structure for a peak, and of those that are
 # compared pixel by pixel, which are the smaller the less the drift changes within.
 _SEARCHED_PX, _COMPARED_PX = 64, 32

@@ -55,17 +55,6 @@ from semcal_ros.core.rectification.raw_positions import rotation_centre, similar
 from semcal_ros.core.registration.inverse_compositional import Alignment, SimilarityFit
 from semcal_ros.core.registration.register import Registration
 
-__all__ = [
-    "SimilarityEstimate",
-    "SimilarityMatch",
-    "SimilarityPredictor",
-    "SimilarityTracker",
-    "TurnedDrift",
-    "constrain_registration",
-    "turn_drift",
-]
-
-
 # Sigmas by which the left and the right half must differ before more than the shift is fitted: a
 # screen that costs nothing, and lets one frame in a hundred through by chance.
 _SCREEN_SIGMAS = 2.5

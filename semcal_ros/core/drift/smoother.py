@@ -39,9 +39,6 @@ from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.errors import InvalidValueError
 
-__all__ = ["Event", "Mark", "estimate_process_noise", "replay", "smooth"]
-
-
 # A measurement costs no more than one at this normalised innovation squared (twice the outlier's 25
 # for shift and shear): a few outliers do not decide on the process noise.
 _MAX_COST = 50.0

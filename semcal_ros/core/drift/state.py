@@ -45,9 +45,6 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 
-__all__ = ["BASE_SIZE", "KEYFRAME_SIZE", "MOTION_SIZE", "DriftState", "initial_state"]
-
-
 #: Numbers in the state: drift, velocity and acceleration; these with the error of the principal
 #: point; those of each keyframe.
 MOTION_SIZE, BASE_SIZE, KEYFRAME_SIZE = 6, 8, 4

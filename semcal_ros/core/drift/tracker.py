@@ -89,9 +89,6 @@ from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.register import Registration, register
 
-__all__ = ["DriftPredictor", "DriftSettings", "DriftTracker", "DriftUpdate"]
-
-
 # The velocity is expected to change by this part of the first step per frame, to begin with.
 _VELOCITY_CHANGE = 0.1
 # A disputed position counts as two standard deviations away.

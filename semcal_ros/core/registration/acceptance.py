@@ -24,9 +24,6 @@ from semcal_ros.core.registration.inverse_compositional import Alignment
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import RegistrationSettings
 
-__all__ = ["find_divergence", "find_failure"]
-
-
 # The coarse peak is the vertex of a parabola, good to a sample of its surface; the rest is for
 # textures whose reduced images alias.
 _STAGE_TOLERANCE_PX = 1.0

@@ -29,8 +29,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 
-__all__ = ["AffineAlignment", "NotAlignedError", "align_affine"]
-
 _ITERATIONS, _EPSILON = 200, 1e-8
 # Sigma of the Gaussian that both images are smoothed with, px: shot noise has no scale.
 _SMOOTHING_PX = 1.5

@@ -36,16 +36,6 @@ from semcal_ros.core.registration.inverse_compositional import TileStatistics
 from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
 from semcal_ros.core.registration.tiles import band_of
 
-__all__ = [
-    "Agreement",
-    "MovingTiles",
-    "TileNoise",
-    "fill_bodies",
-    "find_agreement",
-    "information_weights",
-    "keep_bodies",
-]
-
 # What of the structure of a tile may be missing, or be there besides, as a part of it: contrast changes with charging,
 # focus and contamination by some tenths over a field.
 _MISSING, _BESIDES = 0.4, 0.6

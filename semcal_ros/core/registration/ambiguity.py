@@ -35,9 +35,6 @@ from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["choose_peak", "compare_residuals"]
-
-
 # Part of the residual by which two shifts must differ to be told apart: below it, the error of the
 # interpolation, which depends on the fraction of the shift, decides instead of the specimen.
 _MIN_RESIDUAL_DIFFERENCE = 0.05

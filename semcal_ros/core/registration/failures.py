@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from enum import Enum
 
-__all__ = ["IMAGE_FAILURES", "MatchFailure"]
-
 
 class MatchFailure(Enum):
     """Why an image was not matched with a reference."""

@@ -30,9 +30,6 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.tiles import drop_pixels
 
-__all__ = ["drop_fixed_pixels", "grow_mask"]
-
-
 # Pixels around them into which the filters of gradients and of interpolation smear them, with more than a twentieth of
 # their weight, beyond the smoothing.
 _SMEARED_PX = 2

@@ -34,17 +34,6 @@ from numpy.lib.stride_tricks import as_strided
 
 from semcal_ros.core.arrays import AnyImage, Array, Image
 
-__all__ = [
-    "FINE",
-    "SHARP",
-    "Band",
-    "gradients",
-    "gradients_transposed",
-    "sample_shifted",
-    "sample_tiles",
-]
-
-
 # Frequencies at which a filter of up to 16 taps is fitted: four times as many.
 _SAMPLES = 64
 # Of the diagonal of the normal matrix, added to it: what lies outside the band is left free, and

@@ -67,17 +67,6 @@ from semcal_ros.core.registration.tiles import (
     tile_window,
 )
 
-__all__ = [
-    "Alignment",
-    "SimilarityFit",
-    "TileStatistics",
-    "align",
-    "align_reweighted",
-    "tile_residual_energies",
-    "unmeasured_alignment",
-]
-
-
 # A start that needs more steps than these is outside the range of convergence.
 _MAX_PASSES = 12
 _MAX_COARSE_PASSES = 4

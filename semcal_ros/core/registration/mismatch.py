@@ -30,8 +30,6 @@ from semcal_ros.core.registration.normalised_correlation import (
 )
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["explain_deformation", "explain_mismatch"]
-
 # Longest side at which parts are compared: a part is then 64 px and more of most images.
 _LONGEST_PX = 256
 # Parts per side, and how many must be found for a pattern: two thirds, so that a row may be missing.

@@ -35,19 +35,6 @@ import scipy.fft
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
 
-__all__ = [
-    "ImageStatistics",
-    "estimate_noise_variance",
-    "gaussian_taps",
-    "measure_image",
-    "measure_richest_parts",
-    "passed_gradient",
-    "passed_variance",
-    "shared_pixels",
-    "smooth",
-]
-
-
 # Parts of the image, from its middle, whose spectrum is measured. 256 px tell the smoothing; the
 # corners of the spectrum of 64 px have some 300 coefficients, which tell the noise to 8 %.
 _CROP_PX = 256

@@ -34,15 +34,6 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask, mad_si
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = [
-    "CoarsePeak",
-    "CoarseReference",
-    "find_coarse_peaks",
-    "parabola_vertex",
-    "remove_shading",
-]
-
-
 # Longest sides to which the images are reduced, tried one after the other: each step costs four
 # times as much, and textures with little structure left at one size may have it at the next.
 _LEVELS_PX = (128, 256, 512)

@@ -38,8 +38,6 @@ from semcal_ros.core.registration.normalised_correlation import (
 )
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
 
-__all__ = ["OneDirection", "align_across", "find_direction"]
-
 # Gradient power along the lines over that across, noise taken off, up to which they are lines: that of lines which run
 # within 10 degrees (1-sigma) of each other. The noise is known to a tenth, and has to be less than twice that across.
 _LINES, _NOISE, _MOST_NOISE = 0.03, 0.1, 2.0

@@ -37,8 +37,6 @@ from semcal_ros.core.registration.inverse_compositional import (
 from semcal_ros.core.registration.normalised_correlation import parabola_vertex, remove_shading
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
 
-__all__ = ["choose_period", "find_periods"]
-
 # Side of the part of an image in which periods are looked for.
 _CROP_PX = 512
 # Least period: what repeats faster is beyond the Nyquist limit of a scan that is sampled well.

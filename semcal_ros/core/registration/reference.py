@@ -26,8 +26,6 @@ from semcal_ros.core.registration.one_direction import OneDirection, find_direct
 from semcal_ros.core.registration.periodicity import find_periods
 from semcal_ros.core.registration.tiles import PyramidLevel
 
-__all__ = ["Reference", "Region", "RegistrationSettings"]
-
 #: Valid rectangle (left, top, right, bottom) in px, right and bottom exclusive.
 Region = tuple[int, int, int, int]
 

@@ -71,18 +71,6 @@ from semcal_ros.core.registration.specimen import (
 )
 from semcal_ros.core.registration.tiles import Pyramid, make_level
 
-__all__ = [
-    "Reference",
-    "Region",
-    "Registration",
-    "RegistrationSettings",
-    "prepare_reference",
-    "register",
-    "register_pair",
-    "to_gray",
-]
-
-
 # 48 px leave 36 px between the margins of the filters: 6 x 6 tiles of 6 px, from whose scatter the
 # covariance of the shift can just be told.
 _MIN_SIDE_PX = 48

@@ -47,8 +47,6 @@ from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.tiles import Pyramid
 
-__all__ = ["keep_specimen", "look_at_whole", "refuse_unless_followed"]
-
 # Of a shift that is the specimen's by itself, and at least, with a prediction.
 _MOST_AGREES, _LEAST_SHARE = 0.85, 0.1
 _HALF = 0.5

@@ -28,17 +28,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, invert_scaled
 from semcal_ros.core.registration.tiles import PyramidLevel, TileSums, TileWindow
 
-__all__ = [
-    "TileFit",
-    "TileGeometry",
-    "invert_symmetric",
-    "prepare_geometry",
-    "solve_step",
-    "squared_residuals",
-    "well_posed",
-]
-
-
 # Ramps of gain and offset that explain away more than half of the energy of the gradient that
 # constants leave are not used.
 _MIN_GRADIENT_ENERGY = 0.5

@@ -45,20 +45,6 @@ from semcal_ros.core.registration.noise_spectrum import gaussian_taps, passed_va
 if TYPE_CHECKING:
     from semcal_ros.core.registration.tile_least_squares import TileGeometry
 
-__all__ = [
-    "ALL_PIXELS",
-    "HESSIAN_PIXELS",
-    "Pyramid",
-    "PyramidLevel",
-    "TileSums",
-    "TileWindow",
-    "band_of",
-    "drop_pixels",
-    "make_level",
-    "tile_sums",
-    "tile_window",
-]
-
 
 # Tiles along a side that leave something to compare after gain and offset follow ramps.
 _MIN_TILES = 3

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.drift.estimates import DriftEstimate
-from semcal_ros.core.drift.tracker import DriftSettings, DriftTracker, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftEstimate, DriftSettings, DriftUpdate
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.rectification.binning import bin_image
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.reference import RegistrationSettings

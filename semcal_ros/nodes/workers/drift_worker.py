@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.tracker import DriftPredictor, DriftTracker, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPredictor, DriftUpdate
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 

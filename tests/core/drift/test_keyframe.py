@@ -46,12 +46,8 @@ from semcal_ros.core.drift.state import DriftState, initial_state
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.fractional_delay import FINE
 from semcal_ros.core.registration.inverse_compositional import unmeasured_alignment
-from semcal_ros.core.registration.register import (
-    Registration,
-    RegistrationSettings,
-    register,
-    register_pair,
-)
+from semcal_ros.core.registration.reference import RegistrationSettings
+from semcal_ros.core.registration.register import Registration, register, register_pair
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 
 SIZE = 160

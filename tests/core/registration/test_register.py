@@ -36,9 +36,9 @@ from semcal_ros.core.registration.fractional_delay import (
     sample_tiles,
 )
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
+from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.core.registration.register import (
     Registration,
-    RegistrationSettings,
     prepare_reference,
     register,
     register_pair,
