@@ -65,6 +65,7 @@ def _record_and_calibrate(base):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_ball_comes_out(folder, capsys):
     capsys.readouterr()
     files = ("-o", folder / "ball.ply", "--cloud", folder / "c.ply", "--figure", folder / "b.png")

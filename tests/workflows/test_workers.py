@@ -186,6 +186,7 @@ def test_a_command_whose_worker_is_killed_gives_the_same_pictures(
     np.testing.assert_array_equal(here, there)
 
 
+@pytest.mark.long
 def test_a_calibration_and_its_judgement_are_the_same_to_the_last_bit(cluster):
     plan = calibration_plan(
         preset("jsm820").with_image_size(192, 192), magnifications=(400.0, 2500.0), views=3

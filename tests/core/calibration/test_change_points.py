@@ -62,6 +62,7 @@ def test_a_jump_is_suspected_and_said_but_not_applied():
     assert len(result.model.functions["scale"].breaks) == 0
 
 
+@pytest.mark.long
 def test_a_smooth_microscope_is_not_suspected():
     smooth = calibrated("jsm820", CalibrationOptions(residual="off"))
     assert not any("jump" in w for w in smooth.warnings)

@@ -93,6 +93,7 @@ def relative_errors(
     return found, np.array(camera.pixel_size_sigma_m) / np.array(camera.pixel_size_m)
 
 
+@pytest.mark.long
 def test_flat_views_are_seen_to_be_flat_and_what_that_is_worth_is_said() -> None:
     # Hardly turned either: turned views tell the aspect ratio, and with it that nothing is tilted.
     seen = views((0.0,) * 5, largest_turn=0.05)

@@ -111,6 +111,7 @@ def test_the_advice_is_to_turn_and_its_views_bring_what_it_says() -> None:
     assert reached == pytest.approx(verdict.next_visit.largest, rel=0.5)
 
 
+@pytest.mark.long
 def test_what_was_a_grating_is_looked_for_as_one() -> None:
     done = calibrated([view(3000.0, turn) for turn in THREE])
     pictures = [

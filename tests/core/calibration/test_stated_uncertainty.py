@@ -103,7 +103,7 @@ def test_inside_the_range_nothing_is_added(rising: CalibrationModel) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["jsm820", "pincushion"])
+@pytest.mark.parametrize("name", ["jsm820", pytest.param("pincushion", marks=pytest.mark.long)])
 def test_beyond_the_range_the_truth_is_within_what_is_stated(name: str) -> None:
     """Calibrated over the middle of the range, asked a factor of two and three beyond both ends."""
     middle = tuple(g for g in (*CALIBRATED, *BETWEEN) if 700.0 < g < 4000.0)

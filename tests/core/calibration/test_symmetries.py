@@ -73,6 +73,7 @@ def _largest_sigmas(
     return largest
 
 
+@pytest.mark.long
 def test_the_order_of_the_views_does_not_matter(
     views: list[GridView], model: CalibrationModel
 ) -> None:
@@ -81,6 +82,7 @@ def test_the_order_of_the_views_does_not_matter(
     assert _largest_sigmas(model, _calibrate([views[k] for k in order])) < 1e-6
 
 
+@pytest.mark.long
 def test_twice_as_many_pixels_see_the_same(views: list[GridView], model: CalibrationModel) -> None:
     finer = [
         replace(v, image_xy=2.0 * (v.image_xy + 0.5) - 0.5, sigma_px=2.0 * v.sigma_px)
@@ -105,7 +107,7 @@ def test_the_numbers_of_the_lattice_do_not_matter(
 @pytest.mark.parametrize(
     ("turn", "most_sigmas"),
     [
-        pytest.param(HALF_TURN, 1e-6, id="half a turn"),
+        pytest.param(HALF_TURN, 1e-6, id="half a turn", marks=pytest.mark.long),
         pytest.param(MIRRORED_X, 1e-6, id="mirrored along the lines", marks=pytest.mark.long),
         pytest.param(MIRRORED_Y, 1e-6, id="mirrored across the lines"),
         # Drift within an image comes with the time of the lines: it is another one after a quarter turn.

@@ -35,7 +35,7 @@ from semcal_ros.nodes.frames.live_drift import FrameDrift
 from semcal_ros.nodes.frames.outputs import DriftOutput
 from semcal_ros.nodes.frames.stream import StreamFrame
 from tests.helpers.drift_scenes import make_drift_update
-from tests.helpers.node_fakes import fake_reporter, notes
+from tests.helpers.node_fakes import fake_context, fake_reporter, notes
 from tests.helpers.node_scenes import image_message, stamp_of
 
 SIZE = 32
@@ -54,7 +54,7 @@ class Publishers:
 
 def publish(*updates: DriftUpdate) -> tuple[dict[str, str], dict[str, list[Any]]]:
     publishers, (reporter, _) = Publishers(), fake_reporter()
-    output = DriftOutput(publishers, reporter)  # type: ignore[arg-type]
+    output = DriftOutput(fake_context(publishers, reporter=reporter))
     pixels = np.zeros((SIZE, SIZE), dtype=np.uint8)
     header = image_message(pixels, 7.0).header
     for update in updates:
