@@ -90,6 +90,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_tracker_prints_where_the_bead_is(sweep: Path) -> None:
     (sweep / "bead.py").write_text(listing("rclpy.init()"), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

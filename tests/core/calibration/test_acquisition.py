@@ -121,6 +121,7 @@ def test_it_goes_on_until_the_target_is_met_and_is_right_then() -> None:
     assert largest_error(model) < 3.0 * proposal.largest
 
 
+@pytest.mark.long
 def test_it_ends_when_no_more_views_are_allowed() -> None:
     goal = replace(GOAL, target=1e-5, most_views=24)
     taken = plan_survey(goal)

@@ -57,7 +57,7 @@ def joint():
 @pytest.mark.parametrize(
     "name",
     long_but(
-        lambda name: name in ("jsm820", "parallel"),
+        lambda name: name == "jsm820",
         ["jsm820", "no_distortion", "strong_perspective", "parallel", "off_centre"],
     ),
 )

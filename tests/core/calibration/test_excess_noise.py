@@ -68,6 +68,7 @@ def test_excess_is_added_to_every_corner():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
     microscope = preset("jsm820")
     rng = np.random.default_rng(2)
