@@ -202,7 +202,7 @@ def test_a_calibration_and_its_judgement_are_the_same_to_the_last_bit(cluster):
 
 @pytest.mark.long
 def test_a_ball_is_the_same_to_the_last_bit(cluster, monkeypatch):
-    monkeypatch.setattr(patches_module, "_POINTS_AT_ONCE", 16)
+    monkeypatch.setattr(patches_module, "POINTS_AT_ONCE", 16)
     images, calibration = turning_ball()
     here, there = (
         reconstruct(images, calibration=calibration, spacing_px=10.0, dask=address)
