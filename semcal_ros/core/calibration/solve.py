@@ -57,7 +57,6 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
 )
 from semcal_ros.core.calibration.estimator.thresholds import (
     DAMPING_MIN,
-    FIRST_DAMPING,
     NAMED_MAX,
 )
 from semcal_ros.core.calibration.estimator.variance_components import (
@@ -71,7 +70,6 @@ from semcal_ros.core.calibration.start import with_excess
 from semcal_ros.core.calibration.thresholds import (
     EXACT_STEPS_MAX,
     EXACT_TOLERANCE,
-    NEARLY_THE_SAME,
     SPREAD_CHANGE,
     SPREAD_UPDATES_MAX,
     UPDATE_PREDICTED,
@@ -138,7 +136,6 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
     spread = limit_components(setup, spread)
     state, _ = try_other_poses(setup, functions, spread, adjustment.result.state)
     updates: list[tuple[VarianceComponents, VarianceComponents]] = []
-    near = False
     while len(updates) < SPREAD_UPDATES_MAX:
         problem = build_problem(setup, functions, setup.views, spread)
         result = refine(
@@ -146,13 +143,10 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
             state,
             tolerance=UPDATE_TOLERANCE,
             predicted=UPDATE_PREDICTED,
-            # Undamped once it is near the end: from farther away it may leap into another optimum.
-            first_damping=DAMPING_MIN if near else FIRST_DAMPING,
         )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
         updates.append((spread, update_components(setup, problem, result)))
-        near = largest_change(*updates[-1]) < NEARLY_THE_SAME
         if largest_change(*updates[-1]) < SPREAD_CHANGE:
             break
         spread = accelerate_components(updates)

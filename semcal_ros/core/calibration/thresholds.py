@@ -170,10 +170,6 @@ UPDATE_TOLERANCE = TABLE.stated(
     "UPDATE_TOLERANCE", 1e-9, "of the cost",
     "That a fit between two updates may leave: with more, the updates were seen to go to and fro.",
 )
-NEARLY_THE_SAME = TABLE.stated(
-    "NEARLY_THE_SAME", 1e-3, "relative",
-    "Change of the spreads from which on the fit between two updates starts undamped.",
-)
 UPDATE_PREDICTED = TABLE.stated(
     "UPDATE_PREDICTED", 1e-6, "half chi-square",
     "And what its last step may predict.",
