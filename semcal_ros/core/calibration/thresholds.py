@@ -164,7 +164,7 @@ SPREAD_UPDATES_MAX = TABLE.cost(
 )
 SPREAD_CHANGE = TABLE.stated(
     "SPREAD_CHANGE", 1e-6, "of a spread",
-    "A mirrored recording then gives the mirrored camera to a millionth of a sigma.",
+    "A mirrored recording then gives the mirrored camera to two millionths of a sigma.",
 )
 UPDATE_TOLERANCE = TABLE.stated(
     "UPDATE_TOLERANCE", 1e-9, "of the cost",

@@ -211,8 +211,8 @@ def refine(
 
     With ``fixed_theta`` only the unknowns of the views move; the covariance is that of all unknowns. ``tolerance`` is
     the relative decrease of the cost that ends the iteration; ``predicted`` and ``first_damping`` are those of
-    :func:`~semcal_ros.core.calibration.estimator.trust_region.descend`. The function never raises for lack of convergence: the
-    result says how it ended.
+    :func:`~semcal_ros.core.calibration.estimator.trust_region.descend`. The function never
+    raises for lack of convergence: the result says how it ended.
     """
     effects = problem.effects
     visits, views, lattices = 0, 0, 0
