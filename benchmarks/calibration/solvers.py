@@ -58,7 +58,6 @@ from semcal_ros.core.calibration.estimator.poses import thin_view
 from semcal_ros.core.calibration.estimator.problem import (
     Setup,
     build_problem,
-    stack_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
@@ -71,6 +70,7 @@ from semcal_ros.core.calibration.estimator.residuals import (
 from semcal_ros.core.calibration.pipeline import prepare
 from semcal_ros.core.calibration.select import select
 from semcal_ros.core.calibration.start import start
+from semcal_ros.core.camera.calibration_model import stack_coefficients
 
 # As in the last adjustment of a calibration.
 _TOLERANCE, _MOST_STEPS = 1e-10, 300

@@ -46,7 +46,6 @@ from semcal_ros.core.calibration.estimator.problem import (
     Setup,
     constant_functions,
     initial_components,
-    stack_coefficients,
 )
 from semcal_ros.core.calibration.method_fit import make_model
 from semcal_ros.core.calibration.pipeline import prepare
@@ -54,7 +53,7 @@ from semcal_ros.core.calibration.select import select
 from semcal_ros.core.calibration.solve import solve
 from semcal_ros.core.calibration.start import Start, start
 from semcal_ros.core.calibration.views import GridView
-from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.calibration_model import CalibrationModel, stack_coefficients
 from semcal_ros.core.camera.plane_geometry import mirrored_tilt, rotations_from_vectors
 
 RECORDINGS = ("grid_calibration", "grid_spiral", "grid_real_look", "grid_real_stage")

@@ -47,7 +47,6 @@ from semcal_ros.core.calibration.estimator.problem import (
     VarianceComponents,
     build_problem,
     stack_theta,
-    with_coefficients,
     with_shared,
 )
 from semcal_ros.core.calibration.estimator.residual_field_fit import (
@@ -77,7 +76,7 @@ from semcal_ros.core.calibration.thresholds import (
     TERM_GAIN,
 )
 from semcal_ros.core.calibration.views import estimate_excess_sigma_px
-from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES
+from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES, with_coefficients
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES

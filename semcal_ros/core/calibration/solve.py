@@ -28,7 +28,6 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     Adjustment,
     refine,
 )
-from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import (
     right_way_up,
     try_other_poses,
@@ -46,7 +45,6 @@ from semcal_ros.core.calibration.estimator.problem import (
     Setup,
     VarianceComponents,
     build_problem,
-    with_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residual_field_fit import (
     FittedField,
@@ -75,6 +73,7 @@ from semcal_ros.core.calibration.thresholds import (
     UPDATE_PREDICTED,
     UPDATE_TOLERANCE,
 )
+from semcal_ros.core.camera.calibration_model import with_coefficients
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
@@ -175,12 +174,8 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
         theta, field = solve_field(fitted.system, fitted.choice.prior, fitted.field, keep)
         return with_coefficients(fit.adjustment.functions, theta), field
     functions, result = fit.adjustment.functions, fit.adjustment.result
-    information, gradient = result.information.copy(), result.gradient.copy()
-    information[index] = 0.0
-    gradient[index] = 0.0
-    theta = result.state.theta
-    matrix, right = reduced_normal_equations(fit.adjustment.problem, theta, information, gradient)
-    return with_coefficients(functions, theta + solve_scaled(matrix, right)), None
+    step = solve_scaled(*result.leave_out(index).equations(fit.adjustment.problem))
+    return with_coefficients(functions, result.state.theta + step), None
 
 
 def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> JointFit:

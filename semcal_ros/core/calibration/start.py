@@ -46,9 +46,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
     constant_functions,
     initial_components,
-    stack_coefficients,
     stack_theta,
-    with_coefficients,
 )
 from semcal_ros.core.calibration.estimator.thresholds import COARSE_TOLERANCE
 from semcal_ros.core.calibration.estimator.variance_components import update_components
@@ -63,6 +61,7 @@ from semcal_ros.core.calibration.thresholds import (
     UNTILTED_RAD,
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise
+from semcal_ros.core.camera.calibration_model import stack_coefficients, with_coefficients
 from semcal_ros.core.camera.plane_geometry import fit_homography, view_affine
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -51,6 +51,31 @@ def names_of(functions: Mapping[str, ContinuousFunction]) -> tuple[str, ...]:
     return tuple(name for name in ALL_FUNCTIONS if name in functions)
 
 
+def columns_of(functions: Mapping[str, ContinuousFunction]) -> dict[str, slice]:
+    """Return where the coefficients of each function stand among those of all, in the order of ``ALL_FUNCTIONS``."""
+    names = names_of(functions)
+    stops = np.cumsum([functions[name].size for name in names])
+    return {
+        name: slice(int(stop) - functions[name].size, int(stop))
+        for name, stop in zip(names, stops, strict=True)
+    }
+
+
+def stack_coefficients(functions: Mapping[str, ContinuousFunction]) -> Array:
+    """Return (K,) the coefficients of all functions, as in :func:`columns_of`."""
+    return np.concatenate([functions[name].coefficients for name in names_of(functions)])
+
+
+def with_coefficients(
+    functions: Mapping[str, ContinuousFunction], values: Array
+) -> dict[str, ContinuousFunction]:
+    """Return the functions with coefficients from a vector as of :func:`stack_coefficients`, or a longer one."""
+    return {
+        name: replace(functions[name], coefficients=values[own].copy())
+        for name, own in columns_of(functions).items()
+    }
+
+
 def checked_magnification(magnification: float) -> float:
     """Return the magnification as a float.
 
@@ -74,21 +99,19 @@ def design_matrix(
     functions that need not be there; without ``rows`` they are those of the camera at ``g``.
     """
     known: dict[object, Array] = {}
-    names = names_of(functions)
+    columns = columns_of(functions)
     if rows is None:
-        rows = FUNCTION_NAMES if len(names) == len(FUNCTION_NAMES) else ALL_FUNCTIONS
+        rows = FUNCTION_NAMES if len(columns) == len(FUNCTION_NAMES) else ALL_FUNCTIONS
     place = {name: row for row, name in enumerate(rows)}
-    matrix = np.zeros((len(rows), sum(functions[name].size for name in names)))
-    column = 0
-    for name in names:
+    matrix = np.zeros((len(rows), sum(functions[name].size for name in columns)))
+    for name, own in columns.items():
         function = functions[name]
         # Most functions share their basis.
         key = function.basis_key
         if key not in known:
             known[key] = function.basis(g)
         row = known[key] * nominal_px_per_m if name == "scale" else known[key]
-        matrix[place[name], column : column + len(row)] = row
-        column += len(row)
+        matrix[place[name], own] = row
     return matrix
 
 
@@ -178,7 +201,7 @@ class CalibrationModel:
             raise InvalidValueError(
                 f"a calibration without {', '.join(missing)}", expected=", ".join(FUNCTION_NAMES)
             )
-        size = sum(self.functions[name].size for name in names_of(self.functions))
+        size = len(self.coefficients)
         size += 0 if self.residual is None else self.residual.size
         if self.covariance.shape != (size, size):
             raise InvalidValueError(
@@ -200,11 +223,23 @@ class CalibrationModel:
         return self.image_width, self.image_height
 
     @cached_property
-    def _coefficients(self) -> Array:
-        """All coefficients of the functions, in the order of ``ALL_FUNCTIONS``."""
-        return np.concatenate(
-            [self.functions[name].coefficients for name in names_of(self.functions)]
-        )
+    def coefficients(self) -> Array:
+        """(K,) all coefficients of the functions, as in :func:`columns_of`."""
+        return stack_coefficients(self.functions)
+
+    @property
+    def coefficient_covariance(self) -> Array:
+        """(K, K) their covariance, without that of the residual field."""
+        size = len(self.coefficients)
+        return self.covariance[:size, :size]
+
+    @cached_property
+    def principal_components(self) -> Array:
+        """(K, K) one sigma of each principal component of the coefficients: their covariance is this times its
+        transpose.
+        """
+        variances, directions = np.linalg.eigh(self.coefficient_covariance)
+        return np.asarray(directions * np.sqrt(np.maximum(variances, 0.0)), dtype=np.float64)
 
     @property
     def norm_px(self) -> float:
@@ -233,7 +268,7 @@ class CalibrationModel:
         low, high = self.magnification_range
         in_range = bool(low * (1 - 1e-9) <= g <= high * (1 + 1e-9))
         design = design_matrix(self.functions, g, self.nominal_px_per_m(g))
-        theta = self._coefficients
+        theta = self.coefficients
         size = len(theta)
         covariance = design @ self.covariance[:size, :size] @ design.T
         residual = None

@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
-from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
+from semcal_ros.core.camera.calibration_model import CalibrationModel, columns_of
 from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
@@ -688,23 +688,21 @@ def make_model(measured: LadderMeasurement) -> CalibrationModel:
     functions_part = setup.bounds[2].stop
     columns = setup.theta_columns
     theta = fit.state.theta
-    own = fit.covariance[:functions_part, :functions_part]
-    covariance = columns @ own @ columns.T
+    covariance = columns @ fit.covariance[:functions_part, :functions_part] @ columns.T
     # Jumps that were not found leave the functions.
     dropped = [
         int(column) for k, column in enumerate(setup.jump_columns) if k not in set(fit.jumps)
     ]
     kept = np.setdiff1d(np.arange(len(theta)), dropped)
-    functions, start = {}, 0
-    for name in names_of(setup.functions):
+    functions = {}
+    for name, own in columns_of(setup.functions).items():
         function = setup.functions[name]
-        inside = [k for k in range(start, start + function.size) if k not in dropped]
+        inside = [k for k in range(own.start, own.stop) if k not in dropped]
         breaks = function.breaks
         if name == "scale" and len(breaks):
-            first = start + function.size - len(breaks)
+            first = own.stop - len(breaks)
             breaks = breaks[[k for k in range(len(breaks)) if first + k not in dropped]]
         functions[name] = replace(function, coefficients=theta[inside], breaks=breaks)
-        start += function.size
     whole = covariance[np.ix_(kept, kept)]
     if model.residual is not None:
         whole = _with_field(setup, fit, columns[kept], whole)

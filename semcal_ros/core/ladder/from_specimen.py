@@ -29,7 +29,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive, check_range
 from semcal_ros.core.calibration.stage import fit_stage_moves
-from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, names_of
+from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, columns_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -405,13 +405,7 @@ def _unknown_microscope(
 def _anchored(model: CalibrationModel, anchor: ScaleAnchor) -> CalibrationModel:
     """Multiply all scales so that the pixel size at the anchor is the known one."""
     g = anchor.magnification
-    start = 0
-    for name in names_of(model.functions):
-        if name == "scale":
-            break
-        start += model.functions[name].size
-    scale = model.functions["scale"]
-    own = slice(start, start + scale.size)
+    scale, own = model.functions["scale"], columns_of(model.functions)["scale"]
     row, values = scale.basis(g), scale.coefficients
     wanted = 1.0 / (anchor.pixel_size_m * model.nominal_px_per_m(g))
     now = float(row @ values)

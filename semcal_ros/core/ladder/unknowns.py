@@ -46,8 +46,10 @@ from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
     CalibrationModel,
+    columns_of,
     design_matrix,
     names_of,
+    stack_coefficients,
 )
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES, camera_size
@@ -133,9 +135,7 @@ class LadderSetup:
     @cached_property
     def coefficients(self) -> Array:
         """(K,) coefficients of all functions in the calibration, with zeros for what is new."""
-        return np.concatenate(
-            [self.functions[name].coefficients for name in names_of(self.functions)]
-        )
+        return stack_coefficients(self.functions)
 
     @cached_property
     def visits(self) -> tuple[int, ...]:
@@ -345,14 +345,12 @@ def make_setup(
     breaks = breaks[beyond]
     intervals = tuple(pair for pair, kept in zip(intervals, beyond, strict=True) if kept)
     functions = extend_functions(model, knots, breaks)
-    names = names_of(functions)
     old_columns: list[int] = []
     bends: list[int] = []
     sigmas: list[float] = []
     jumps: list[int] = []
-    column = 0
-    for name in names:
-        own, before = functions[name], model.functions[name]
+    for name, columns in columns_of(functions).items():
+        own, before, column = functions[name], model.functions[name], columns.start
         new_bends = len(own.extension) - max(len(before.extension), 1) if len(own.extension) else 0
         kept = own.smooth_size + max(len(own.extension) - 1, 0) - new_bends
         old_columns += range(column, column + kept)
@@ -362,10 +360,8 @@ def make_setup(
         for number, place in enumerate(own.breaks):
             is_old = bool(np.any(np.isclose(place, before.breaks, rtol=1e-12)))
             (old_columns if is_old else jumps).append(start + number)
-        column += own.size
-    size = sum(model.functions[name].size for name in names)
-    known = prior_root(model.covariance[:size, :size])
-    root = np.zeros((column, known.shape[1]))
+    known = prior_root(model.coefficient_covariance)
+    root = np.zeros((sum(own.size for own in functions.values()), known.shape[1]))
     root[old_columns] = known
     return LadderSetup(
         model=model,
@@ -414,19 +410,17 @@ def start_state(setup: LadderSetup) -> LadderState:
     """The state before anything is measured: beyond the grid the functions stay as they are at its end."""
     values = np.zeros(setup.size)
     place = {int(column): k for k, column in enumerate(setup.bend_columns)}
-    column = 0
-    for name in names_of(setup.functions):
+    for name, columns in columns_of(setup.functions).items():
         own = setup.functions[name]
-        own_bends = [c for c in range(column, column + own.size) if c in place]
+        own_bends = [c for c in range(columns.start, columns.stop) if c in place]
         if own_bends:
             knots = own.extension[len(own.extension) - len(own_bends) - 1 :]
             flat = own(float(knots[0]))
             basis = np.stack([own.basis(float(g)) for g in knots[1:]])
             wanted = flat - basis @ own.coefficients
-            inner = basis[:, [c - column for c in own_bends]]
+            inner = basis[:, [c - columns.start for c in own_bends]]
             bends = np.linalg.solve(inner, wanted)
             values[setup.bounds[1]][[place[c] for c in own_bends]] = bends
-        column += own.size
     return LadderState(setup, values)
 
 

@@ -31,13 +31,12 @@ from semcal_ros.core.calibration.estimator.problem import (
     Priors,
     Setup,
     build_problem,
-    stack_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residuals import corner_residuals
 from semcal_ros.core.calibration.pipeline import fit_joint
 from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.start import measure_misfit_px
-from semcal_ros.core.camera.calibration_model import design_matrix
+from semcal_ros.core.camera.calibration_model import design_matrix, stack_coefficients
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 

@@ -40,7 +40,6 @@ from semcal_ros.core.calibration.estimator.problem import (
     build_problem,
     constant_functions,
     initial_components,
-    stack_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residuals import (
     VIEW_RESIDUALS,
@@ -52,6 +51,7 @@ from semcal_ros.core.calibration.estimator.residuals import (
 )
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices
+from semcal_ros.core.camera.calibration_model import stack_coefficients
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.grid_views import grid_views
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views

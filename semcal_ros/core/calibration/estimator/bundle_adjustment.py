@@ -137,6 +137,22 @@ class BundleResult:
         """(N,) the points that the camera does not show at all."""
         return ~np.all(np.isfinite(self.residuals_px), axis=1)
 
+    def equations(self, problem: Problem) -> tuple[Array, Array]:
+        """Return the reduced normal equations (K, K) and (K,) of a change of theta from here, with its prior.
+
+        ``problem`` is the one that was adjusted, or the same with another prior.
+        """
+        return reduced_normal_equations(problem, self.state.theta, self.information, self.gradient)
+
+    def leave_out(self, magnification: int) -> BundleResult:
+        """Return the result with nothing known from one magnification; its equations then lead to the solution
+        without its views, whose poses follow linearly.
+        """
+        information, gradient = self.information.copy(), self.gradient.copy()
+        information[magnification] = 0.0
+        gradient[magnification] = 0.0
+        return replace(self, information=information, gradient=gradient)
+
     def rms_px(self) -> float:
         """Return the RMS distance of observed and projected corners, px."""
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))

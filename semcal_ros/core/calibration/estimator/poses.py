@@ -39,7 +39,6 @@ from semcal_ros.core.calibration.estimator.problem import (
     Setup,
     VarianceComponents,
     build_problem,
-    with_coefficients,
 )
 from semcal_ros.core.calibration.estimator.residuals import view_residuals
 from semcal_ros.core.calibration.estimator.thresholds import (
@@ -51,7 +50,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     WIDE_RATIO,
 )
 from semcal_ros.core.calibration.views import GridView
-from semcal_ros.core.camera.calibration_model import names_of
+from semcal_ros.core.camera.calibration_model import columns_of, with_coefficients
 from semcal_ros.core.camera.plane_geometry import (
     AffineView,
     mirrored_tilt,
@@ -193,10 +192,8 @@ def mirror(functions: Functions, problem: Problem, state: State) -> State:
     what a stage says: its axis is turned over, since a tilt of the other sign is one about the opposite axis. Exact
     where rho is a constant.
     """
-    names = list(names_of(functions))
-    first = sum(functions[name].size for name in names[: names.index("rho")])
     theta = state.theta.copy()
-    theta[first : first + functions["rho"].size] *= -1.0
+    theta[columns_of(functions)["rho"]] *= -1.0
     for k, name in enumerate(problem.shared, start=len(theta) - len(problem.shared)):
         if name in _ODD:
             theta[k] *= -1.0

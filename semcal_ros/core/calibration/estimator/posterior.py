@@ -75,7 +75,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     RESERVE_SIZE_MIN,
     USUAL_CHANGES,
 )
-from semcal_ros.core.camera.calibration_model import names_of
+from semcal_ros.core.camera.calibration_model import columns_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.fit_record import Certificate
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -90,13 +90,11 @@ def certify(functions: Functions, problem: Problem, result: BundleResult) -> Cer
         If one more Newton step would move an unknown by more than its sigma, or the equations have no solution. The
         message names the unknowns.
     """
-    matrix, right = reduced_normal_equations(
-        problem, result.state.theta, result.information, result.gradient
-    )
+    matrix, right = result.equations(problem)
     sigmas = np.sqrt(np.maximum(np.diag(result.covariance), 0.0))
     scaled, _ = equilibrate(matrix)
     values = np.linalg.eigvalsh(scaled) if np.all(np.isfinite(scaled)) else np.zeros(1)
-    names = [name for name in names_of(functions) for _ in range(functions[name].size)]
+    names = [name for name in columns_of(functions) for _ in range(functions[name].size)]
     names += list(problem.shared)
     if not (values[0] > 0.0 and np.all(np.isfinite(sigmas)) and np.all(sigmas > 0.0)):
         weak = [
@@ -116,12 +114,11 @@ def certify(functions: Functions, problem: Problem, result: BundleResult) -> Cer
             expected="views of one flat grid, by one microscope, at the magnifications that are stated",
             do="leave out views that are not such, or record more",
         )
-    held, start = [], 0
-    for name in names_of(functions):
-        prior = problem.prior_sigma[start]
-        if np.isfinite(prior) and result.covariance[start, start] > (HELD_PART * prior) ** 2:
+    held = []
+    for name, own in columns_of(functions).items():
+        prior, first = problem.prior_sigma[own.start], sigmas[own.start]
+        if np.isfinite(prior) and first**2 > (HELD_PART * prior) ** 2:
             held.append(name)
-        start += functions[name].size
     return Certificate(
         remaining_sigmas=float(remaining.max()),
         last_decrease=max(result.last_decrease, 0.0),
@@ -357,13 +354,11 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
     sigma, theta = problem.prior_sigma.copy(), result.state.theta
     for _ in range(CHANGE_UPDATES):
         known = replace(problem, prior_sigma=sigma)
-        matrix, right = reduced_normal_equations(known, theta, result.information, result.gradient)
+        matrix, right = result.equations(known)
         freed = theta + solve_scaled(matrix, right)
         variance = np.diagonal(invert_scaled(matrix))
-        start = 0
-        for name in names_of(padded):
-            own = slice(start + 1, start + padded[name].smooth_size)
-            start += padded[name].size
+        for name, every in columns_of(padded).items():
+            own = slice(every.start + 1, every.start + padded[name].smooth_size)
             if name not in SMOOTH_AT_LAST or own.stop == own.start:
                 continue
             usual = problem.prior_sigma[own]
@@ -387,10 +382,7 @@ def pad_covariance(setup: Setup, padded: PaddedAdjustment, field: FittedField | 
     state = result.state
     size = len(state.theta) - len(setup.shared)
     if field is None:
-        reduced = reduced_normal_equations(
-            problem, state.theta, result.information, result.gradient
-        )
-        covariance, moved = result.covariance, solve_scaled(*reduced)
+        covariance, moved = result.covariance, solve_scaled(*result.equations(problem))
     else:
         system = field_system(setup, problem, result, field.field)
         # This one is scaled to the variance that the residuals show.
@@ -436,11 +428,9 @@ def split_covariance(padded: PaddedAdjustment) -> CovarianceParts:
 def _left_out(chosen: Functions, padded: Functions) -> Indices:
     """Indices of the coefficients that the padded functions have and the chosen ones have not."""
     out: list[int] = []
-    start = 0
-    for name in names_of(padded):
-        own, whole = chosen[name], padded[name]
-        out += range(start + own.smooth_size, start + whole.smooth_size)
-        start += whole.size
+    for name, own in columns_of(padded).items():
+        first = own.start
+        out += range(first + chosen[name].smooth_size, first + padded[name].smooth_size)
     return np.array(out, dtype=np.intp)
 
 

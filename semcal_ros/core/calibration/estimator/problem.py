@@ -42,6 +42,7 @@ from semcal_ros.core.camera.calibration_model import (
     FUNCTION_NAMES,
     design_matrix,
     names_of,
+    stack_coefficients,
 )
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES
@@ -468,17 +469,6 @@ def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
     return np.concatenate([m for m, _ in parts]), np.concatenate([s for _, s in parts])
 
 
-def with_coefficients(functions: Functions, theta: Array) -> dict[str, ContinuousFunction]:
-    """Return the functions with coefficients from a vector in the order of ``ALL_FUNCTIONS``."""
-    out: dict[str, ContinuousFunction] = {}
-    start = 0
-    for name in names_of(functions):
-        stop = start + functions[name].size
-        out[name] = replace(functions[name], coefficients=theta[start:stop].copy())
-        start = stop
-    return out
-
-
 def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, ContinuousFunction]:
     """Make functions that do not depend on the magnification, except for their jumps."""
     g_range = (float(setup.magnifications[0]), float(setup.magnifications[-1]))
@@ -493,11 +483,6 @@ def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, C
         )
         for name in FUNCTION_NAMES
     }
-
-
-def stack_coefficients(functions: Functions) -> Array:
-    """Return (K,) all coefficients in the order of ``ALL_FUNCTIONS``."""
-    return np.concatenate([functions[name].coefficients for name in names_of(functions)])
 
 
 def stack_theta(setup: Setup, functions: Functions, state: State) -> Array:

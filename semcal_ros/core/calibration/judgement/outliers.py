@@ -35,7 +35,6 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     refine,
     variance_factor,
 )
-from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import whitened_norm
 from semcal_ros.core.calibration.judgement.thresholds import (
@@ -92,9 +91,7 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
         squares = problem.effects.visit_sigmas**2
         scatter = float(np.sum(result.state.visits**2 / squares))
         determined = float(np.sum(np.maximum(1.0 - result.visit_variance / squares, 0.0)))
-    matrix, right = reduced_normal_equations(
-        problem, result.state.theta, result.information, result.gradient
-    )
+    matrix, right = result.equations(problem)
     g = setup.magnifications
     nominal = setup.nominal_px_per_m(g)
     variance = max(variance_factor(problem, result), 1.0)

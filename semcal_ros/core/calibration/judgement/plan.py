@@ -53,7 +53,6 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
     design_matrix,
-    names_of,
     pixel_size_gradient,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -153,7 +152,7 @@ def plan_views(
         # Beyond, the grid shows nothing.
         low, high = model.ladder.anchored
     candidates = np.geomspace(low, high, CANDIDATES) if high > low else np.array([low])
-    root = np.concatenate([_root(model), _aged(model, ageing)], axis=1)
+    root = np.concatenate([model.principal_components, _aged(model, ageing)], axis=1)
     rows = np.stack([pixel_size_gradient(model, float(g)) @ root for g in judged])  # (G, 2, K)
     floor = np.array(
         [
@@ -208,13 +207,6 @@ def _mean_variance(precision: Array, rows: Array, fixed: Array) -> float:
     """A smooth form of the largest variance: its eighth-power mean, so that ties have an order."""
     own = np.max(np.einsum("gak,kl,gal->ga", rows, np.linalg.inv(precision), rows), axis=1)
     return float(np.mean((own + fixed**2) ** 8) ** 0.125)
-
-
-def _root(model: CalibrationModel) -> Array:
-    """(K, K) the covariance of the coefficients as root root'."""
-    size = sum(model.functions[name].size for name in names_of(model.functions))
-    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
-    return directions * np.sqrt(np.maximum(variances, 0.0))
 
 
 def _aged(model: CalibrationModel, ageing: float) -> Array:

@@ -60,7 +60,6 @@ from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
     CalibrationModel,
     design_matrix,
-    names_of,
 )
 from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.core.camera.projection import ALL_NAMES
@@ -100,7 +99,7 @@ class Revision:
     @property
     def components(self) -> slice:
         """Where the components of the calibration's covariance are among the unknowns."""
-        return slice(1, 1 + sum(own.size for own in self.model.functions.values()))
+        return slice(1, 1 + len(self.model.coefficients))
 
     @property
     def changes(self) -> slice:
@@ -192,12 +191,8 @@ def _camera_designs(model: CalibrationModel, setup: Setup) -> tuple[Array, Array
     The first unknown is 1; the next are the principal components of the calibration's covariance, in sigmas;
     the last are the height of the grid and the size of its squares.
     """
-    theta = np.concatenate(
-        [model.functions[name].coefficients for name in names_of(model.functions)]
-    )
+    theta, root = model.coefficients, model.principal_components
     size = len(theta)
-    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
-    root = directions * np.sqrt(np.maximum(variances, 0.0))
     own = _designs_of_size(model, setup.magnifications, setup.image_size)
     cameras = own[:, :, :size] @ theta + own[:, :, size]
     common = np.zeros((*cameras.shape, 2))

@@ -45,7 +45,7 @@ from semcal_ros.core.calibration.judgement.revision import (
 from semcal_ros.core.calibration.judgement.thresholds import AGEING_MAX, DEFAULT_AGEING, SHAPE_PART
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
-from semcal_ros.core.camera.calibration_model import CalibrationModel, names_of
+from semcal_ros.core.camera.calibration_model import CalibrationModel, columns_of, with_coefficients
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 
@@ -173,20 +173,16 @@ def change_directions(model: CalibrationModel, image_width: int) -> Array:
     image_width
         Of the images in whose pixels a centre moves.
     """
-    functions = [model.functions[name] for name in names_of(model.functions)]
-    starts = np.cumsum([0, *(own.size for own in functions)])
+    columns = columns_of(model.functions)
     # Images of another size have their centre at another pixel, in other units.
     per_px = model.image_width / image_width
-    changes = np.zeros((int(starts[-1]), len(CHANGING)))
+    changes = np.zeros((len(model.coefficients), len(CHANGING)))
     for column, name in enumerate(CHANGING):
-        k = names_of(model.functions).index(name)
-        own = slice(int(starts[k]), int(starts[k + 1]))
+        own, function = columns[name], model.functions[name]
         if name == "scale":
-            changes[own, column] = functions[k].coefficients
+            changes[own, column] = function.coefficients
         else:
-            changes[own, column] = _constant(functions[k]) * (
-                per_px if name in ("ex", "ey") else 1.0
-            )
+            changes[own, column] = _constant(function) * (per_px if name in ("ex", "ey") else 1.0)
     return changes
 
 
@@ -197,18 +193,6 @@ def _constant(function: ContinuousFunction) -> Array:
     return np.asarray(np.linalg.lstsq(basis, np.ones(len(grid)), rcond=None)[0], dtype=np.float64)
 
 
-def _steps(revision: Revision) -> tuple[Array, Array]:
-    """Change of the coefficients, (K, K + P), per unit of the components and of :data:`CHANGING`; and (K, K) of the
-    former alone.
-    """
-    model = revision.model
-    size = sum(model.functions[name].size for name in names_of(model.functions))
-    variances, directions = np.linalg.eigh(model.covariance[:size, :size])
-    root = directions * np.sqrt(np.maximum(variances, 0.0))
-    changes = change_directions(model, revision.setup.image_size[0])
-    return np.concatenate([root, changes], axis=1), root
-
-
 def _apply(revision: Revision) -> CalibrationModel:
     """The posterior of the coefficients.
 
@@ -216,13 +200,11 @@ def _apply(revision: Revision) -> CalibrationModel:
     covariance, and loses of its correlation with the coefficients what these lose of their uncertainty.
     """
     model, theta = revision.model, revision.result.state.theta
-    steps, root = _steps(revision)
-    size = len(root)
+    root = model.principal_components
+    changes = change_directions(model, revision.setup.image_size[0])
+    steps, size = np.concatenate([root, changes], axis=1), len(root)
     index = np.r_[revision.components, revision.changes]
-    values = np.concatenate(
-        [model.functions[name].coefficients for name in names_of(model.functions)]
-    )
-    values = values + steps @ theta[index]
+    values = model.coefficients + steps @ theta[index]
     own = revision.covariance[np.ix_(index, index)]
     covariance = model.covariance.copy()
     covariance[:size, :size] = steps @ own @ steps.T
@@ -232,9 +214,6 @@ def _apply(revision: Revision) -> CalibrationModel:
         covariance[:size, size:] = steps @ gain @ cross
         covariance[size:, :size] = covariance[:size, size:].T
     covariance = 0.5 * (covariance + covariance.T)
-    functions, start = {}, 0
-    for name in names_of(model.functions):
-        function = model.functions[name]
-        functions[name] = replace(function, coefficients=values[start : start + function.size])
-        start += function.size
-    return replace(model, functions=functions, covariance=covariance)
+    return replace(
+        model, functions=with_coefficients(model.functions, values), covariance=covariance
+    )

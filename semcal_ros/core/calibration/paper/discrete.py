@@ -46,11 +46,10 @@ from semcal_ros.core.calibration.estimator.problem import (
     Setup,
     build_problem,
     constant_functions,
-    stack_coefficients,
 )
 from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.calibration.views import GridView
-from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
+from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, stack_coefficients
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.plane_geometry import (
     fit_homography,
