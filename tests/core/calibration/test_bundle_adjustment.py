@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.estimator.blocks import State, make_problem
-from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
+from semcal_ros.core.calibration.estimator.bundle_adjustment import refine, variance_factor
 from semcal_ros.core.calibration.estimator.residuals import corner_residuals
 from semcal_ros.core.calibration.stage import height_of_tilt
 from semcal_ros.core.calibration.views import GridView
@@ -160,6 +160,37 @@ def test_outliers_lose_their_weight(poses):
     sigma = np.sqrt(np.diag(clean.covariance))
     # Two gross errors among some 100 corners of a view move no parameter by more than its own uncertainty.
     assert np.all(np.abs(result.state.theta - clean.state.theta) < 1.5 * sigma)
+
+
+def _mean_square_over_stated(poses, outliers):
+    """Of 60 draws of the noise, with some corners wrong by 30 sigmas: the errors of theta over what is stated."""
+    clean = grid_views(MICROSCOPE.camera_at, GS, seed=1)
+    start = State(np.ones(20), poses.rotations, poses.translations_m)
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        views = []
+        for view in clean:
+            xy = view.image_xy + rng.normal(0.0, 0.05, view.image_xy.shape)
+            angle = rng.uniform(-np.pi, np.pi, len(xy))
+            wrong = 1.5 * (rng.uniform(size=len(xy)) < outliers)
+            xy += wrong[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            views.append(replace(view, image_xy=xy, sigma_px=np.full(len(xy), 0.05)))
+        problem = _problem(0.05, views)
+        result = refine(problem, start)
+        variance = np.diag(result.covariance) * variance_factor(problem, result)
+        squares.append((result.state.theta - 1.0) ** 2 / variance)
+    return np.mean(squares, axis=0)
+
+
+def test_outliers_widen_the_covariance_as_much_as_they_scatter_the_estimate(poses):
+    # Some unknowns hang on priors, of heights and of their own, which do not scatter here: clean corners are the measure.
+    clean, spoiled = _mean_square_over_stated(poses, 0.0), _mean_square_over_stated(poses, 0.03)
+    determined = clean > 0.5
+    assert determined.sum() >= 8
+    # 1-sigma of the ratio is 0.1: some independent unknowns, each drawn 60 times. The mean square of the weighted
+    # residuals would make the covariance twice as large as it should be, and the ratio a half.
+    assert np.mean(spoiled[determined]) / np.mean(clean[determined]) == pytest.approx(1.0, abs=0.3)
 
 
 def test_fixed_theta_moves_only_the_poses(poses):

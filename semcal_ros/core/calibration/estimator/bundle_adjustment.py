@@ -455,8 +455,13 @@ def weighted_squares(problem: Problem, result: BundleResult) -> Array:
 
 
 def variance_factor(problem: Problem, result: BundleResult) -> float:
-    """Return the mean square of the whitened residuals per degree of freedom (Huber-weighted)."""
-    norm2 = weighted_squares(problem, result)
+    """Return by how much the corners scatter more than they state, as a factor of the covariance.
+
+    It is the mean square of the scores per degree of freedom. The score of a whitened residual is that residual times
+    its weight: an outlier pulls by no more than Huber's constant, and makes the estimate no more uncertain than that
+    (Huber, Robust Statistics, 1981, equation 7.6.8).
+    """
+    norm2 = weighted_squares(problem, result) * result.huber_weight
     unknowns = problem.layout.of_view.size * len(problem.group) + len(result.state.theta)
     freedom = problem.dimensions * result.huber_weight.sum() - unknowns - result.state.visits.size
     return float(max(norm2.sum() / max(freedom, 1.0), 1e-12))
