@@ -23,7 +23,10 @@ from typing import Any
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_factor
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    residual_variance,
+    variance_factor,
+)
 from semcal_ros.core.calibration.estimator.posterior import CovarianceParts, certify
 from semcal_ros.core.calibration.estimator.problem import Functions, Setup
 from semcal_ros.core.calibration.estimator.residual_field_fit import FittedField
@@ -215,7 +218,9 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     factor = variance_factor(adjustment.problem, result)
     findings = []
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
-    misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
+    misfit = np.sqrt(residual_variance(adjustment.problem, result)) * np.hypot(
+        1.0, fit.excess_px / own_px
+    )
     if misfit > MISFIT_MAX:
         excess_px, excess_at = measure_excess(setup, fit)
         findings.append(

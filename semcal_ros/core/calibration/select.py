@@ -38,7 +38,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     BundleResult,
     refine,
     refit_functions,
-    variance_factor,
+    residual_variance,
 )
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses, refine_coarsely
 from semcal_ros.core.calibration.estimator.problem import (
@@ -110,7 +110,7 @@ class Summary:
         """Summarise an adjustment, scaled to the variance that its residuals show."""
         cameras = problem.designs @ result.state.theta
         right = np.einsum("mpq,mq->mp", result.information, cameras) + result.gradient
-        variance = variance_factor(problem, result)
+        variance = residual_variance(problem, result)
         shared = len(problem.prior_mean) - len(problem.shared)
         return cls(
             result.information / variance,

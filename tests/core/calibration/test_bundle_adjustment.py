@@ -184,7 +184,8 @@ def _mean_square_over_stated(poses, outliers):
 
 
 def test_outliers_widen_the_covariance_as_much_as_they_scatter_the_estimate(poses):
-    # Some unknowns hang on priors, of heights and of their own, which do not scatter here: clean corners are the measure.
+    # Some unknowns hang on priors, of heights and of their own, which do not scatter here: clean corners are the
+    # measure.
     clean, spoiled = _mean_square_over_stated(poses, 0.0), _mean_square_over_stated(poses, 0.03)
     determined = clean > 0.5
     assert determined.sum() >= 8

@@ -37,6 +37,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     Adjustment,
     BundleResult,
     refine,
+    residual_variance,
     variance_factor,
 )
 from semcal_ros.core.calibration.estimator.normal_equations import (
@@ -386,7 +387,7 @@ def pad_covariance(setup: Setup, padded: PaddedAdjustment, field: FittedField | 
     else:
         system = field_system(setup, problem, result, field.field)
         # This one is scaled to the variance that the residuals show.
-        covariance = system.covariance(field.choice.prior) / factor
+        covariance = system.covariance(field.choice.prior) / residual_variance(problem, result)
         theta, freed = solve_field(system, field.choice.prior, field.field)
         change = freed.coefficients - field.field.coefficients
         moved = np.concatenate([theta - state.theta, change.ravel()])

@@ -30,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, variance_factor
+from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, residual_variance
 from semcal_ros.core.calibration.estimator.normal_equations import sum_by
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import (
@@ -214,7 +214,7 @@ def field_system(
     ``of_grid`` the field is one of displacements on the grid, which turns with it, and not one of
     the image.
     """
-    variance = variance_factor(problem, result)
+    variance = residual_variance(problem, result)
     own_variance = np.concatenate([v.own_variance_share for v in setup.views])
     scaled = replace(problem, whitening=problem.whitening / np.sqrt(variance))
     corners = corner_rows(scaled, result.state)

@@ -31,7 +31,7 @@ from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     BundleResult,
     refine,
-    variance_factor,
+    residual_variance,
 )
 from semcal_ros.core.calibration.estimator.poses import adjust
 from semcal_ros.core.calibration.estimator.posterior import estimate_jitter, jitter_covariance
@@ -261,7 +261,7 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
         problem = _build(model, setup, spread, sigmas)
         result = refine(problem, result.state)
-    misfit = float(np.sqrt(variance_factor(problem, result)))
+    misfit = float(np.sqrt(residual_variance(problem, result)))
     freedom = problem.layout.of_view.size * len(setup.views) + len(theta)
     excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
     if excess > 0.0:
