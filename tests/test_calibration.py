@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from semcal_ros import Calibration, SemcalError
 from semcal_ros.core.calibration.pipeline import calibrate_views
-from semcal_ros.core.camera.ladder_record import LadderRecord
+from semcal_ros.core.camera.records import LadderRecord
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.calibration.curves import parts_by_specimen
 from semcal_ros.synthetic import preset

@@ -25,10 +25,10 @@ import click
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import HEIGHT, LENGTH, PATH, json_option
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table
-from semcal_ros.core.camera.provenance import NOT_RECORDED
+from semcal_ros.core.camera.records import NOT_RECORDED
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.term_sizes import has_terms, measure_along_axes
-from semcal_ros.core.camera.uncertainty_budget import (
+from semcal_ros.core.camera.uncertainty import (
     UncertaintyBudget,
     budget_of_length,
     budget_of_pixel_size,

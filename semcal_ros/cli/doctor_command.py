@@ -21,7 +21,7 @@ from pathlib import Path
 
 import click
 
-from semcal_ros.bridge.names import absolute_namespace
+from semcal_ros.bridge.fields import absolute_namespace
 from semcal_ros.cli.options import PATH, Quantity, config_option
 from semcal_ros.cli.output import echo_json
 from semcal_ros.core.wording import counted

@@ -34,7 +34,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.bridge.conditions import read_conditions
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.config.config import MicroscopeConfig

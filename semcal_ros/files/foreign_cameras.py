@@ -29,8 +29,7 @@ import numpy as np
 import yaml
 
 from semcal_ros.core.arrays import Array, Array32
-from semcal_ros.core.camera.pinhole_model import PinholeModel
-from semcal_ros.core.camera.plumb_bob import PlumbBobCamera
+from semcal_ros.core.camera.pinhole_model import PinholeModel, PlumbBobCamera
 from semcal_ros.core.camera.scan_camera import ScanCamera
 
 

@@ -30,8 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.compressed import decoded_image, describe_compressed
-from semcal_ros.bridge.fields import require_fields
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import require_fields, stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config

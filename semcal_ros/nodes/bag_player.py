@@ -30,7 +30,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
-from semcal_ros.bridge.headers import fill_stamp
+from semcal_ros.bridge.fields import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, InvalidValueError, SemcalError
 from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag

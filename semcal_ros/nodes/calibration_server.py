@@ -26,8 +26,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from semcal_ros.bridge.calibration_text import fill_calibration_text
-from semcal_ros.bridge.calibration_warnings import ScaleWarnings
+from semcal_ros.bridge.calibration import ScaleWarnings, fill_calibration_text
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.calibration import Calibration
@@ -37,7 +36,7 @@ from semcal_ros.core.calibration.acquisition import (
 from semcal_ros.core.calibration.judgement.check import Verdict
 from semcal_ros.core.calibration.options import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import (
     CalibrationError,

@@ -27,11 +27,16 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64MultiArray, Header, String
 
-from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.camera import (
+    StaticFrame,
+    fill_camera_info,
+    fill_projection,
+    fill_projection_covariance,
+    fill_static_frames,
+    static_frames,
+)
 from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.bridge.projection import fill_projection, fill_projection_covariance
-from semcal_ros.bridge.static_frames import StaticFrame, fill_static_frames, static_frames
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import ConfigError, InvalidValueError, SemcalError
 from semcal_ros.middleware.message_types import message_class

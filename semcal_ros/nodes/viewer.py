@@ -37,7 +37,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import InvalidValueError, Rejection

@@ -41,7 +41,7 @@ from semcal_ros.applications.servoing import (
     find_target,
 )
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
-from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.fields import copy_header
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.base import SemNode

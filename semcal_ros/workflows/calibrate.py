@@ -49,7 +49,7 @@ from semcal_ros.core.calibration.views import (
     SquareAssignment,
     assign_squares,
 )
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.corners import PATTERN_NAMES
 from semcal_ros.core.errors import (
     CalibrationError,

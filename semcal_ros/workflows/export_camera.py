@@ -26,8 +26,7 @@ from pathlib import Path
 import tifffile
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.camera.pinhole_model import PinholeModel, fit_pinhole
-from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
+from semcal_ros.core.camera.pinhole_model import PinholeModel, fit_pinhole, fit_plumb_bob
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes, atomic_write_text

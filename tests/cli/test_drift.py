@@ -30,7 +30,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from semcal_ros.bridge.headers import fill_header, stamp_ns_from_msg
+from semcal_ros.bridge.fields import fill_header, stamp_ns_from_msg
 from semcal_ros.bridge.images import fill_image, image_from_message
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath

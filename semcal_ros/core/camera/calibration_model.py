@@ -25,10 +25,8 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.fit_record import FitRecord
-from semcal_ros.core.camera.ladder_record import LadderRecord
 from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import FitRecord, LadderRecord, Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError

@@ -18,17 +18,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from semcal_ros.bridge.calibration_text import fill_calibration_text
-from semcal_ros.bridge.camera_info import fill_camera_info
+from semcal_ros.bridge.calibration import fill_calibration_text
+from semcal_ros.bridge.camera import fill_camera_info, fill_projection, fill_stamped_projection
 from semcal_ros.bridge.drift import (
     fill_drift,
     fill_drift_velocity,
     rotation_of,
     rotation_rate_of,
 )
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.bridge.projection import fill_projection, fill_stamped_projection
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.config.config import MicroscopeConfig

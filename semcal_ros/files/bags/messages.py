@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.magnification import published_number
 from semcal_ros.config.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import STAGE_TYPE
 from semcal_ros.files.bags.messages import blank_message

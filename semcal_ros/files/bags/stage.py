@@ -23,8 +23,8 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
-from semcal_ros.bridge.scan_interval import scan_interval_ns
 from semcal_ros.bridge.stage import doubt_unit, missing_joints, read_stage, tilt_jump_rad
+from semcal_ros.bridge.zero_order_hold import scan_interval_ns
 from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError

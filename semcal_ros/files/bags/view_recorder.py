@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage

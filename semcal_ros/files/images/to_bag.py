@@ -26,7 +26,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import (
     IMAGE_TYPE,

@@ -25,11 +25,12 @@ from typing import Any
 
 from std_msgs.msg import String
 
-from semcal_ros.bridge.calibration_text import (
+from semcal_ros.bridge.calibration import (
+    ScaleWarnings,
     calibration_text_from_message,
     fill_calibration_text,
+    read_scale_warnings,
 )
-from semcal_ros.bridge.calibration_warnings import ScaleWarnings, read_scale_warnings
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera

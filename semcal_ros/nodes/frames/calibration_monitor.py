@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig

@@ -25,7 +25,7 @@ from rclpy.callback_groups import CallbackGroup
 from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.conditions import compare_conditions
-from semcal_ros.core.camera.provenance import NOT_RECORDED
+from semcal_ros.core.camera.records import NOT_RECORDED
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.parameters import ParameterDeclaration

@@ -23,10 +23,9 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
-from semcal_ros.bridge.scan_interval import scan_interval_ns
-from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware.message_types import message_class

@@ -27,7 +27,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Header
 
 from semcal_ros.bridge.conditions import fill_conditions
-from semcal_ros.bridge.headers import fill_header, fill_stamp, optional_stamp_ns
+from semcal_ros.bridge.fields import fill_header, fill_stamp, optional_stamp_ns
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import published_number
 from semcal_ros.config.config import IMAGE_TYPE

@@ -21,7 +21,7 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.stage import (
     doubt_unit,
     missing_joints,

@@ -31,7 +31,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.config.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera

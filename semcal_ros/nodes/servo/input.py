@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray
 
-from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.bridge.images import image_from_message, to_gray
-from semcal_ros.bridge.projection import (
+from semcal_ros.bridge.camera import (
     projection_from_message,
     stamped_projection_covariance_from_message,
     stamped_projection_from_message,
 )
+from semcal_ros.bridge.fields import stamp_ns_from_msg
+from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import image_input, stream_output, value_input

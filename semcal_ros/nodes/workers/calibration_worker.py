@@ -32,7 +32,7 @@ from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.plan import judge_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted

@@ -22,9 +22,9 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.calibration.judge import CalibrationResult
-from semcal_ros.core.camera.predicted_error import make_field_lattice
 from semcal_ros.core.camera.projection import PARAMETER_NAMES, project_points_with_jacobians
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty import make_field_lattice
 
 # Prior on the change of a pose without distortion, rad: directions that a view does not constrain
 # must not diverge.

@@ -33,10 +33,10 @@ from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.conditions import describe_condition
-from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
-from semcal_ros.core.camera.provenance import NOT_RECORDED, Provenance
+from semcal_ros.core.camera.records import NOT_RECORDED, Provenance
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.term_sizes import describe_term_sizes, has_terms, measure_terms
+from semcal_ros.core.camera.uncertainty import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.report.calibration.geometry import compute_displacements
 from semcal_ros.report.html.text import (
     format_length,

@@ -23,12 +23,12 @@ from matplotlib.axes import Axes
 
 from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.camera.calibration_model import CalibrationModel
-from semcal_ros.core.camera.predicted_error import (
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty import (
     make_field_lattice,
     predict_aligned_sigma_px,
     predict_shape_sigma_px,
 )
-from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.curves import (
     mark_magnifications,
     read_curve,

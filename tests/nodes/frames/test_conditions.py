@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
 from semcal_ros.nodes.frames.conditions import ConditionsWatch
 from tests.helpers.node_fakes import FakeEndpoints, fake_context, fake_reporter, notes

@@ -20,8 +20,7 @@ import math
 
 import pytest
 
-from semcal_ros.bridge.scan_interval import scan_interval_ns
-from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
 from semcal_ros.config.config import MicroscopeConfig, parse_config
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.frames.load_monitor import LoadMonitor

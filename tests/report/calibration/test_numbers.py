@@ -36,13 +36,13 @@ from semcal_ros.core.calibration.judgement.findings import (
 from semcal_ros.core.calibration.method_fit import Finding, rank_findings
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.predicted_error import (
+from semcal_ros.core.camera.residual_field import zero_field
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty import (
     make_field_lattice,
     predict_aligned_sigma_px,
     predict_shape_sigma_px,
 )
-from semcal_ros.core.camera.residual_field import zero_field
-from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.report.calibration.error_figures import plot_residual_field, plot_rms
 from semcal_ros.report.calibration.geometry import (
     compute_displacements,

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
+from semcal_ros.core.camera.pinhole_model import fit_plumb_bob
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic import preset
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Warnings that stand in a calibration file, in a form that is safe to log and to publish."""
+"""A calibration in messages: its text in a std_msgs/msg/String, and its warnings, safe to log and to publish."""
 
 from __future__ import annotations
 
@@ -21,6 +21,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from semcal_ros.bridge.fields import require_fields
+from semcal_ros.core.errors import InvalidValueError, MessageError
+
+# A file's size grows with the square of its coefficients, 49 MB for 3000; ours have a few hundred,
+# so about 0.5 MB.
+MAX_TEXT_BYTES = 16 * 1024 * 1024
+"""Limit far above any calibration, so that a wrong file or topic cannot exhaust memory in the parser.
+
+It is the same for files and topics, so that a node can publish whatever it can read.
+"""
+
 SCALE_PREFIX = "scale:"
 """Begin of the warnings that judge nm per pixel."""
 
@@ -28,6 +39,45 @@ SCALE_PREFIX = "scale:"
 _LONGEST, _SHORT = 400, 160
 # More kinds of warnings than there are; the text of all then has at most 4 kB or so.
 _MOST = 10
+
+
+def calibration_text_from_message(message: Any) -> str:
+    """Return the text of a calibration, not yet parsed.
+
+    Raises
+    ------
+    MessageError
+        There is no text, or it is empty or longer than :data:`MAX_TEXT_BYTES`.
+    """
+    require_fields(message, ("data",), "std_msgs/msg/String")
+    text = message.data
+    if not isinstance(text, str):
+        raise MessageError(
+            f"a calibration of type {type(text).__name__}",
+            expected="std_msgs/msg/String",
+            do="check the type of the topic",
+        )
+    size = len(text.encode("utf-8", errors="replace"))
+    if not text.strip() or size > MAX_TEXT_BYTES:
+        raise MessageError(
+            f"a calibration message with {size} bytes of text",
+            expected=f"the text of a calibration file, 1 to {MAX_TEXT_BYTES} bytes",
+            do="check which node publishes the calibration topic",
+        )
+    return text
+
+
+def fill_calibration_text(message: Any, text: str) -> None:
+    """Set the text; raises :class:`InvalidValueError` if a receiver would refuse it."""
+    try:
+        size = len(text.encode("utf-8"))
+    except UnicodeEncodeError as error:
+        raise InvalidValueError("a calibration text with an incomplete character") from error
+    if not text.strip() or size > MAX_TEXT_BYTES:
+        raise InvalidValueError(
+            f"a calibration text of {size} bytes", expected=f"1 to {MAX_TEXT_BYTES} bytes"
+        )
+    message.data = text
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from semcal_ros.bridge.calibration_warnings import ScaleWarnings, read_scale_warnings
+from semcal_ros.bridge.calibration import ScaleWarnings, read_scale_warnings
 
 
 def test_only_the_warnings_about_the_scale_count() -> None:

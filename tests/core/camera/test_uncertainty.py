@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma
-from semcal_ros.core.camera.uncertainty_budget import budget_of_length, budget_of_pixel_size
+from semcal_ros.core.camera.uncertainty import budget_of_length, budget_of_pixel_size
 from semcal_ros.core.errors import InvalidValueError
 from tests.helpers.calibrations import calibrated
 

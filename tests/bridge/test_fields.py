@@ -12,22 +12,22 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Names of ROS 2 (https://design.ros2.org/articles/topic_and_service_names.html)."""
+"""Names that ROS accepts."""
 
 from __future__ import annotations
 
+import pytest
+
+from semcal_ros.bridge.fields import absolute_namespace
 from semcal_ros.core.errors import InvalidValueError
 
 
-def absolute_namespace(namespace: str) -> str:
-    """Return a namespace such as ``sem/left/`` in the form ``/sem/left``.
+@pytest.mark.parametrize("given", ["sem/left", "/sem/left", "/sem/left/"])
+def test_a_namespace_has_one_form(given):
+    assert absolute_namespace(given) == "/sem/left"
 
-    Raises
-    ------
-    InvalidValueError
-        If ROS would not accept it.
-    """
-    parts = namespace.strip("/").split("/")
-    if not all(part.isascii() and part.isidentifier() for part in parts):
-        raise InvalidValueError(f"namespace {namespace!r}", expected="a ROS namespace such as /sem")
-    return "/" + "/".join(parts)
+
+@pytest.mark.parametrize("given", ["", "/", "a b", "1st", "sem//left", "s\u00e9m"])
+def test_what_ros_refuses_is_refused(given):
+    with pytest.raises(InvalidValueError, match="namespace"):
+        absolute_namespace(given)
