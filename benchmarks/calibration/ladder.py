@@ -53,7 +53,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.uncertainty import predict_aligned_sigma_px
 from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
 from semcal_ros.core.ladder.matching import LadderPicture
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 __all__ = ["Case", "compare", "draw_case", "record"]
 

@@ -39,7 +39,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     PLANNED_TILTS_RAD,
 )
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.ladder.plan import PlannedStep, plan_ladder
+from semcal_ros.core.ladder.acquisition import PlannedStep, plan_ladder
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
 

@@ -24,6 +24,7 @@ from semcal_ros.synthetic.detector import NOISE_FREE, Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
 from semcal_ros.synthetic.live import LiveFrame, LiveScene, VirtualStage
 from semcal_ros.synthetic.microscope import (
+    PRESETS,
     Constant,
     Exponential,
     Logistic,
@@ -31,6 +32,7 @@ from semcal_ros.synthetic.microscope import (
     Saturation,
     VirtualMicroscope,
     conditions_of,
+    preset,
 )
 from semcal_ros.synthetic.plans import (
     CALIBRATION_MAGNIFICATIONS,
@@ -45,7 +47,6 @@ from semcal_ros.synthetic.plans import (
     zoom_plan,
 )
 from semcal_ros.synthetic.pose import Pose, random_poses
-from semcal_ros.synthetic.presets import PRESETS, preset
 from semcal_ros.synthetic.render import render_frame, render_reflectivity
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.grid import (

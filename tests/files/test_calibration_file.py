@@ -33,7 +33,7 @@ from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 
 @pytest.fixture(scope="module", params=["joint", "discrete", "pda"])

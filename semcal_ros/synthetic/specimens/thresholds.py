@@ -156,7 +156,7 @@ BALL_MARGIN_M = TABLE.derived(
     "More than perspective moves the outline by at the end of the tip.",
 )
 
-# Bodies, in ball_body.py
+# Bodies, in ball.py
 
 BODY_TILE = TABLE.cost(
     "BODY_TILE", 128, "voxels",

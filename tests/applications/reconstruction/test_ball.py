@@ -27,7 +27,7 @@ from semcal_ros.applications.reconstruction import (
     adjust,
     fit_sphere,
 )
-from semcal_ros.applications.reconstruction.roundness import (
+from semcal_ros.applications.reconstruction.ball import (
     Roundness,
     _quadrics,
     _SphereResiduals,
