@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from benchmarks.table import show
 from semcal_ros.cli import main as semcal
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import (
     RecordingPlan,
     calibration_plan,

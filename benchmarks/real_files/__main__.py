@@ -46,7 +46,7 @@ from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.corners.pattern import PATTERN_NAMES
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.images.image_file import describe_image_file
-from semcal_ros.files.tiff.values import quantity
+from semcal_ros.files.images.metadata import quantity
 
 # Pixel sizes are compared to the four digits that makers print.
 SAME = 5e-4

@@ -54,7 +54,7 @@ from examples.cantilever.figure_16a import (
     show_comparison,
 )
 from examples.cantilever.scenes import measure_scenes
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.files.bags.writer import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import (
     STAGES,
     TYPICAL_GRID,

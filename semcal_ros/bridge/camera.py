@@ -39,7 +39,7 @@ from semcal_ros.bridge.fields import (
     whole_number,
 )
 from semcal_ros.bridge.images import PixelFormat, fill_image, image_from_message
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError

@@ -31,7 +31,7 @@ from semcal_ros.cli.output import (
     show_progress,
 )
 from semcal_ros.cli.recording_input import check_outputs, recording_input
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.ladder.extend import LadderStep
 from semcal_ros.core.ladder.matching import RejectedPair
 from semcal_ros.core.ladder.thresholds import SETTLED_DRIFT_PX

@@ -28,7 +28,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 import click
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.tiff.values import angle_in_degrees, plain_number, quantity
+from semcal_ros.files.images.metadata import angle_in_degrees, plain_number, quantity
 from semcal_ros.workflows.options import (
     OVERWRITE,
     SQUARES,

@@ -28,7 +28,7 @@ import click
 
 from semcal_ros.cli.options import calibration_option, no_drift_option
 from semcal_ros.cli.recording_input import optional_recording_input
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import open_source, resolve_calibration, resolve_config

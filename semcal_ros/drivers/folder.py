@@ -39,13 +39,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.stage import doubt_unit
-from semcal_ros.config.config import StageConfig
+from semcal_ros.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import MicroscopeError, SemcalError, UnusableFrameError
 from semcal_ros.drivers.source import SourceFrame
 from semcal_ros.files.atomic import atomic_write_text
 from semcal_ros.files.images.image_file import ImagePage, describe_image_file, is_image_file
-from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.images.sem_image import VendorSettings
 from semcal_ros.files.video import VIDEO_SUFFIXES
 
 # A file that was closed or renamed into place is most often complete; a program that opens it once more, to append its

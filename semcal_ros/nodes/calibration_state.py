@@ -31,9 +31,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.calibration.acquisition import (
     ViewRequest,
     find_picture_fault,
@@ -49,7 +50,6 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejectio
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.recorded import RecordedView
 from semcal_ros.nodes.workers.calibration_worker import (
     CalibrationJob,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.errors import ConfigError, InvalidValueError
 from semcal_ros.drivers.choose import SOURCES
 from semcal_ros.drivers.source import FrameSource

@@ -22,8 +22,9 @@ from typing import Annotated
 
 import numpy as np
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.findings import find_all
@@ -59,7 +60,6 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import (
     PATTERN,
     UNTILTED,

@@ -29,15 +29,15 @@ from pathlib import Path
 from typing import Any
 
 import semcal_ros
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.wording import printable
 from semcal_ros.files.images.image_series import find_image_files
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.inputs import Source
 
 # Stamps before 2001 count from the start of a recording, not from 1970.

@@ -26,15 +26,14 @@ from typing import Annotated, NamedTuple
 
 from semcal_ros.bridge.fields import absolute_namespace
 from semcal_ros.calibration import Calibration
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.corrected import CorrectedBagWriter
-from semcal_ros.files.bags.writer import BagWriter
+from semcal_ros.files.bags.writer import BagWriter, CorrectedBagWriter
 from semcal_ros.files.images.image_file import is_image_file
 from semcal_ros.files.images.write import (
     TIFF_SUFFIXES,

@@ -25,7 +25,7 @@ from typing import Annotated
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
     DRIFTS,

@@ -29,7 +29,7 @@ import pytest
 
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.cli import main
-from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, StageConfig
+from semcal_ros.config import MagnificationConfig, MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.doctor import environment_checks as checks
 from semcal_ros.doctor.diagnosis import check_calibration, describe_calibration, evaluate
@@ -63,7 +63,7 @@ from semcal_ros.doctor.stream_checks import (
     check_transport_time,
     describe_magnifications,
 )
-from semcal_ros.middleware.transport_advice import PROFILE_VARIABLES
+from semcal_ros.middleware import PROFILE_VARIABLES
 from semcal_ros.workflows.simulate import simulate
 from tests.helpers.node_scenes import make_calibration, write_recording
 from tests.helpers.project import NODES, ROOT

@@ -48,7 +48,7 @@ from semcal_ros.bridge.images import (
     without_databar,
 )
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
-from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
+from semcal_ros.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message

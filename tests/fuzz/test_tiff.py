@@ -32,6 +32,8 @@ from hypothesis import strategies as st
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.images.image_file import read_plain_image
+from semcal_ros.files.images.metadata import PIXEL_SIZE_RANGE_M, plain_number, quantity
+from semcal_ros.files.images.sem_image import SemImage
 from semcal_ros.files.images.to_bag import METADATA_TOPIC, import_images
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tiff.read import (
@@ -40,8 +42,6 @@ from semcal_ros.files.tiff.read import (
     read_sem_settings,
     read_sem_tiff,
 )
-from semcal_ros.files.tiff.sem_image import SemImage
-from semcal_ros.files.tiff.values import PIXEL_SIZE_RANGE_M, plain_number, quantity
 from tests.helpers.fuzz_inputs import changed, damaged, edited_text
 from tests.helpers.fuzz_support import attempt, fuzz, run_semcal
 

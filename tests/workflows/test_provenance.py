@@ -23,10 +23,10 @@ import numpy as np
 import pytest
 
 from semcal_ros import Calibration
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.bridge.conditions import Conditions
+from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.inputs import resolve_config
 from semcal_ros.workflows.provenance import ConditionsComparison, describe_provenance
 from tests.helpers.calibrations import DEFAULT, calibrated

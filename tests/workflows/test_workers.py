@@ -36,7 +36,7 @@ from semcal_ros import calibrate, reconstruct, rectify, stack
 from semcal_ros.applications.reconstruction import patches as patches_module
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import Drift, calibration_plan, drift_plan, preset
 from semcal_ros.workflows import stack as stack_module
 from semcal_ros.workflows import workers as module

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
+from semcal_ros.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.reader import BagTopic
 

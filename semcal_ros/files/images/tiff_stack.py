@@ -30,11 +30,10 @@ import tifffile
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import TiffError
+from semcal_ros.files.images.metadata import parse_xml, quantity
 from semcal_ros.files.images.ome_tiff import DATABAR_ROWS
 from semcal_ros.files.tiff.pixels import MAX_PIXELS, MAX_SIDE_PX, grey_image
 from semcal_ros.files.tiff.read import open_tiff
-from semcal_ros.files.tiff.values import quantity
-from semcal_ros.files.tiff.xml_tag import parse_xml
 
 _MAX_PAGES = 100_000
 _MAX_BYTES = 8

@@ -30,6 +30,14 @@ import tifffile
 from numpy.typing import NDArray
 
 from semcal_ros.core.errors import TiffError
+from semcal_ros.files.images.metadata import (
+    XML_TAG,
+    decode_text,
+    find_side_file,
+    parse_xml,
+    read_side_file,
+)
+from semcal_ros.files.images.sem_image import SemImage, VendorSettings
 from semcal_ros.files.tiff import (
     hitachi,
     jeol,
@@ -37,7 +45,6 @@ from semcal_ros.files.tiff import (
     phenom,
     tescan,
     thermo_fisher,
-    xml_tag,
     zeiss,
 )
 from semcal_ros.files.tiff.imagej import (
@@ -48,8 +55,6 @@ from semcal_ros.files.tiff.imagej import (
     imagej_settings,
 )
 from semcal_ros.files.tiff.pixels import check_directories, grey_image, page_size
-from semcal_ros.files.tiff.sem_image import SemImage, VendorSettings
-from semcal_ros.files.tiff.values import decode_text, find_side_file, read_side_file
 
 SUFFIXES = (".tif", ".tiff")
 # Bounds what a damaged chain of directories can request; a series of this length fills a day at 1 Hz.
@@ -109,8 +114,8 @@ def _tag_settings(
             return thermo_fisher.thermo_fisher_settings(path, value, size_px)
     if olympus.TAG in tags and isinstance(tags[olympus.TAG].value, dict):
         return olympus.olympus_settings(path, tags[olympus.TAG].value)
-    if xml_tag.TAG in tags:
-        return _xml_settings(path, tags[xml_tag.TAG].value, size_px)
+    if XML_TAG in tags:
+        return _xml_settings(path, tags[XML_TAG].value, size_px)
     if tescan.TAG in tags:
         value = tags[tescan.TAG].value
         data = value if isinstance(value, bytes) else str(value).encode()
@@ -119,13 +124,13 @@ def _tag_settings(
 
 
 def _xml_settings(path: Path, document: Any, size_px: tuple[int, int]) -> VendorSettings:
-    root = xml_tag.parse_xml(path, document if isinstance(document, bytes) else str(document))
+    root = parse_xml(path, document if isinstance(document, bytes) else str(document))
     if root.tag == phenom.ROOT:
         return phenom.phenom_settings(path, root, size_px)
     if root.tag == thermo_fisher.ROOT:
         return thermo_fisher.thermo_fisher_xml_settings(path, root, size_px)
     raise TiffError(
-        f"{path.name}: tag {xml_tag.TAG} holds XML with the root {str(root.tag)[:40]!r}",
+        f"{path.name}: tag {XML_TAG} holds XML with the root {str(root.tag)[:40]!r}",
         expected=f"{thermo_fisher.ROOT} (Thermo Fisher) or {phenom.ROOT} (Phenom)",
         do="export the image again with its metadata",
     )

@@ -29,7 +29,7 @@ from semcal_ros.bridge.diagnostics import (
     DiagnosticSummary,
     fill_diagnostic_status,
 )
-from semcal_ros.config.config import StageConfig
+from semcal_ros.config import StageConfig
 from semcal_ros.core.errors import MicroscopeError, SemcalError
 from semcal_ros.drivers.limits import MotionLimits, describe_target, joint_unit
 from semcal_ros.drivers.source import JOINTS

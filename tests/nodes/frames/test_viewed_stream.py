@@ -26,7 +26,7 @@ from sensor_msgs.msg import Image
 
 from semcal_ros.nodes.common.qos import stream_output
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription
-from semcal_ros.nodes.frames.viewed_stream import PolledGroup, ViewedImages
+from semcal_ros.nodes.viewer import PolledGroup, ViewedImages
 from tests.helpers.node_fakes import FakeEndpoints, fake_context
 from tests.helpers.node_scenes import image_message
 from tests.helpers.ros_process import Peer

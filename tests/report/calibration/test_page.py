@@ -35,7 +35,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.tiff.values import quantity
+from semcal_ros.files.images.metadata import quantity
 from semcal_ros.report import write_calibration_report
 from semcal_ros.report.calibration.examples import (
     choose_examples,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which shared memory a process has, by its environment, beside what Fast DDS really makes; and what is advised."""
+"""Which prefixes the ament index is searched under."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ from pathlib import Path
 import pytest
 
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.middleware.transport_advice import (
+from semcal_ros.middleware import (
     DEFAULT_SEGMENT_BYTES,
     MALLOC_VARIABLES,
     PROFILE_VARIABLES,
+    add_environment_prefix,
     profile_file,
     shared_memory,
     transport_advice,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ROOT / "dds" / "fastdds_large_images.xml"
 MIB = 1024**2
 FAST = "rmw_fastrtps_cpp"
@@ -54,6 +55,41 @@ names = set(re.findall(r"/dev/shm/fast(?:rtps|dds)_[0-9a-f]{16}$", open("/proc/s
 print("segments", *(os.stat(name).st_size for name in names))
 rclpy.shutdown()
 """
+
+
+@pytest.fixture
+def prefix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    marker = tmp_path / "share" / "ament_index" / "resource_index" / "packages" / "semcal_ros"
+    marker.parent.mkdir(parents=True)
+    marker.touch()
+    return tmp_path
+
+
+def test_the_environment_comes_first_and_only_once(
+    prefix: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
+    for _ in range(2):
+        add_environment_prefix()
+        assert os.environ["AMENT_PREFIX_PATH"] == f"{prefix}{os.pathsep}/opt/ros/jazzy"
+
+
+def test_an_empty_variable_adds_no_empty_prefix(
+    prefix: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "")
+    add_environment_prefix()
+    assert os.environ["AMENT_PREFIX_PATH"] == str(prefix)
+
+
+def test_an_environment_without_the_suite_is_not_added(
+    prefix: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "prefix", str(prefix / "other"))
+    add_environment_prefix()
+    assert "AMENT_PREFIX_PATH" not in os.environ
 
 
 def profile(transports: str = "", rtps: str = "") -> str:

@@ -25,7 +25,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.frames.conditions import ConditionsWatch
+from semcal_ros.nodes.frames.held_values import ConditionsWatch
 from tests.helpers.node_fakes import FakeEndpoints, fake_context, fake_reporter, notes
 from tests.helpers.node_scenes import make_calibration
 

@@ -21,8 +21,7 @@ from typing import Any
 
 import pytest
 
-from semcal_ros.nodes.common.source_watch import SourceWatch
-from semcal_ros.nodes.common.subscription import AdaptiveSubscription
+from semcal_ros.nodes.common.subscription import AdaptiveSubscription, SourceWatch
 
 SEM, BAG = "/sem/virtual_sem", "/sem/bag_player"
 NOTHING: tuple[list[str], list[str]] = ([], [])

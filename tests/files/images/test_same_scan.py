@@ -22,8 +22,8 @@ from typing import Any
 
 import pytest
 
-from semcal_ros.files.tiff.same_scan import group_by_scan
-from semcal_ros.files.tiff.sem_image import VendorSettings
+from semcal_ros.files.images.image_series import group_by_scan
+from semcal_ros.files.images.sem_image import VendorSettings
 
 SIZE_PX = (32, 20)
 FIRST = VendorSettings(

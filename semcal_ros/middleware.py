@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether this process is set up for images of a given size: the shared memory of Fast DDS, and malloc.
+"""DDS below the nodes and the doctor, without an import of ROS: transport, security, message classes, the ament index.
 
 A message that fits into the shared memory of its sender goes over at once. A larger one waits for
 room again and again, and meanwhile best-effort messages are lost. ``doc/nodes.md``, "Large images",
@@ -22,15 +22,19 @@ Of the shared memory, the default is judged, and a profile that states the size 
 does. The rules for everything else (built-in transports by name, socket buffers) differ between versions of Fast DDS
 and are left to its documentation:
 https://fast-dds.docs.eprosima.com (shared memory transport, XML profiles, environment variables).
+
 """
 
 from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 from semcal_ros.core.errors import ConfigError
@@ -56,6 +60,12 @@ _VERSIONS = {
     2: ("fastrtps", "DEFAULT_FASTRTPS_PROFILES.xml"),
     3: ("fastdds", "DEFAULT_FASTDDS_PROFILES.xml"),
 }
+
+_VARIABLE = "AMENT_PREFIX_PATH"
+_MARKER = Path("share", "ament_index", "resource_index", "packages", "semcal_ros")
+
+
+_added: list[str] = []
 
 
 def transport_advice(image_bytes: int, environment: Mapping[str, str], rmw: str) -> str:
@@ -206,3 +216,70 @@ def _largest_segment(path: Path) -> int | None:
         if element.tag.rpartition("}")[2] == "segment_size"
     ]
     return max((int(size) for size in sizes if size.isdecimal()), default=None)
+
+
+def check_security(environment: Mapping[str, str] = os.environ) -> None:
+    """Refuse settings that ROS would take as no security at all, without a word.
+
+    Raises
+    ------
+    ConfigError
+        ``ROS_SECURITY_ENABLE`` or ``ROS_SECURITY_STRATEGY`` is misspelt, or there is no keystore.
+    """
+    enabled = _one_of(environment, "ROS_SECURITY_ENABLE", "true", "false")
+    strategy = _one_of(environment, "ROS_SECURITY_STRATEGY", "Enforce", "Permissive")
+    if (enabled, strategy) == ("true", "Enforce") and not environment.get("ROS_SECURITY_KEYSTORE"):
+        raise ConfigError(
+            "ROS_SECURITY_KEYSTORE is not set",
+            expected="the folder of a keystore, because security is enforced",
+            do="see doc/security.md",
+        )
+
+
+def _one_of(environment: Mapping[str, str], name: str, *accepted: str) -> str:
+    value = environment.get(name, "")
+    if value and value not in accepted:
+        raise ConfigError(
+            f"{name} is {value!r}",
+            expected=" or ".join(accepted),
+            do="ROS would run this node without security",
+        )
+    return value
+
+
+def message_class(type_name: str) -> Any:
+    """Class of a type such as ``"std_msgs/msg/Float64"``.
+
+    Raises
+    ------
+    ConfigError
+        The name is malformed or the package is not installed.
+    """
+    parts = type_name.split("/")
+    if len(parts) == 3 and parts[1] == "msg" and all(part.isidentifier() for part in parts):
+        try:
+            return getattr(import_module(f"{parts[0]}.msg"), parts[2])
+        except (ImportError, AttributeError):
+            pass
+    raise ConfigError(
+        f"message type {type_name!r}",
+        expected="an installed type such as std_msgs/msg/Float64",
+        do="correct its spelling or install the package it comes from",
+    )
+
+
+def add_environment_prefix() -> None:
+    """Put the prefix of this Python environment in front of ``AMENT_PREFIX_PATH``, if the suite is installed there.
+
+    The setup script of a ROS installation or of a workspace sets the variable for what it holds. An environment that
+    pip made has no such script, so the suite's executables and commands call this first. Child processes inherit it.
+    """
+    prefixes = [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p]
+    if sys.prefix not in prefixes and (Path(sys.prefix) / _MARKER).is_file():
+        os.environ[_VARIABLE] = os.pathsep.join([sys.prefix, *prefixes])
+        _added.append(sys.prefix)
+
+
+def prefixes_of_user() -> list[str]:
+    """Return the prefixes of ``AMENT_PREFIX_PATH`` that :func:`add_environment_prefix` did not put there."""
+    return [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p and p not in _added]

@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from semcal_ros.nodes.common.publisher import PatientPublisher
+from semcal_ros.nodes.common.endpoints import PatientPublisher
 
 
 class Middleware:

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
+from semcal_ros.nodes.calibration_server import OUTPUT, OutputFile
 from tests.nodes.common.test_parameters import declared
 
 

@@ -12,13 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One SEM image with the settings that its file declares."""
+"""One SEM image with the settings that its file declares: scale, databar and conditions."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -26,74 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.conditions import NUMBERS, TEXTS
-from semcal_ros.core.camera.conditions import FILE_NAMES
-
-
-@dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """How an image was taken, in SI units; None, or an empty text, where a file does not say it.
-
-    Parameters
-    ----------
-    maker
-        ``zeiss``, ``thermo_fisher``, ``tescan``, ``jeol``, ``hitachi``, ``phenom``, ``olympus`` or, for a copy that
-        ImageJ saved without the maker's metadata, ``imagej``.
-    model, serial_number
-        Name and serial number of the microscope.
-    detector
-        Detector or signal.
-    beam
-        ``electron`` or ``ion``.
-    acceleration_voltage_v
-        Acceleration voltage, without its sign.
-    working_distance_m
-        Working distance.
-    beam_current_a
-        Current of the beam on the specimen.
-    scan_rotation_rad, stage_tilt_rad, stage_rotation_rad
-        Angles in the maker's sense of rotation.
-    dwell_s
-        Time on each pixel in one pass.
-    frame_time_s
-        Time of one pass over the frame.
-    frame_interval_s
-        Time from one page of the file to the next.
-    time
-        Local time of the recording, without a time zone.
-    """
-
-    maker: str = ""
-    model: str = ""
-    serial_number: str = ""
-    detector: str = ""
-    beam: str = ""
-    acceleration_voltage_v: float | None = None
-    working_distance_m: float | None = None
-    beam_current_a: float | None = None
-    scan_rotation_rad: float | None = None
-    stage_tilt_rad: float | None = None
-    stage_rotation_rad: float | None = None
-    dwell_s: float | None = None
-    frame_time_s: float | None = None
-    frame_interval_s: float | None = None
-    time: datetime | None = None
-
-    def conditions(self) -> dict[str, Any]:
-        """All conditions by name as plain values for JSON."""
-        values = {item.name: getattr(self, item.name) for item in fields(Conditions)}
-        return {**values, "time": None if self.time is None else self.time.isoformat()}
-
-    def topic_values(self) -> dict[str, float | str]:
-        """What is known of what the topic ``conditions`` tells, by its keys."""
-        found = {key: getattr(self, FILE_NAMES.get(key, key)) for key in (*NUMBERS, *TEXTS)}
-        return {key: value for key, value in found.items() if value not in (None, "")}
-
-    @classmethod
-    def from_topic(cls, values: Mapping[str, float | str]) -> Conditions:
-        """Make them of the values of the topic ``conditions``; other keys are left out."""
-        known = {FILE_NAMES.get(k, k): v for k, v in values.items() if k in (*NUMBERS, *TEXTS)}
-        return Conditions(**known)  # type: ignore[arg-type]
+from semcal_ros.bridge.conditions import Conditions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Metadata as text: numbers with units, dates, and the files next to an image in which some makers keep them."""
+"""Metadata as text: numbers with units, dates, XML, and the files next to an image in which some makers keep them.
+
+The XML stands in a tag that the microscopes of Thermo Fisher and Phenom share.
+
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,7 @@ import math
 import re
 from datetime import datetime
 from pathlib import Path
+from xml.etree import ElementTree
 
 from semcal_ros.core.errors import TiffError
 
@@ -34,6 +39,10 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _DURATIONS_S = {"sec": 1.0, "secs": 1.0, "min": 60.0, "mins": 60.0, "hour": 3600.0, "hours": 3600.0}
 _PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
 _MAX_BYTES = 1_000_000  # the text files have a few kB
+
+# Private TIFF tag of FEI, FEI_TITAN.
+XML_TAG = 34683
+_MAX_CHARS = 1_000_000  # real ones have some 10 kB
 
 
 def _split(text: object) -> tuple[float, str] | None:
@@ -193,3 +202,55 @@ def read_side_file(path: Path) -> bytes:
     """The contents of a text file, cut off far beyond the size that makers' files have."""
     with path.open("rb") as file:
         return file.read(_MAX_BYTES)
+
+
+def parse_xml(path: Path, document: str | bytes) -> ElementTree.Element:
+    """Return the root of the document.
+
+    Raises
+    ------
+    TiffError
+        It is not XML, is too long, or declares entities, which could expand without bound.
+    """
+    text = document.decode("utf-8", errors="replace") if isinstance(document, bytes) else document
+    text = text.replace("\x00", "").strip()
+    if len(text) > _MAX_CHARS or "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
+        raise TiffError(
+            f"{path.name}: tag {XML_TAG} holds XML with declarations, or too much of it",
+            expected="the plain XML of Thermo Fisher or Phenom",
+            do="copy the file again from the microscope",
+        )
+    # An encoding in the declaration is wrong once the text is decoded.
+    body = re.sub(r"^<\?xml[^>]*\?>", "", text)
+    try:
+        return ElementTree.fromstring(body)
+    except ElementTree.ParseError as error:
+        raise TiffError(
+            f"{path.name}: tag {XML_TAG} is not XML: {error}",
+            expected="the XML of Thermo Fisher or Phenom",
+            do="copy the file again from the microscope",
+        ) from error
+
+
+def text_of(root: ElementTree.Element, place: str) -> str:
+    """Return the text at ``place``, empty if there is none."""
+    return (root.findtext(place) or "").strip()
+
+
+def number_of(root: ElementTree.Element, place: str) -> float | None:
+    """Return the bare number at ``place``."""
+    return plain_number(text_of(root, place))
+
+
+def quantity_of(root: ElementTree.Element, place: str, base: str) -> float | None:
+    """Return the SI value at ``place`` whose unit is in the attribute ``unit``; None without a unit."""
+    element = root.find(place)
+    if element is None:
+        return None
+    return quantity(f"{element.text} {element.get('unit', '')}", base)
+
+
+def date_of(root: ElementTree.Element, place: str) -> datetime | None:
+    """Return the date at ``place``; parts of a second and a zone are dropped, as the time is a local one."""
+    match = re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d", text_of(root, place))
+    return None if match is None else first_date([(match.group(), "%Y-%m-%dT%H:%M:%S")])
