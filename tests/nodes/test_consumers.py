@@ -30,7 +30,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.core.camera.calibrated_frame import CalibratedFrame
 from semcal_ros.core.errors import ConfigError, InvalidValueError
-from semcal_ros.nodes.frames.consumer import CONSUMERS, Consumer, choose_consumers
+from semcal_ros.nodes.suite import CONSUMERS, Consumer, choose_consumers
 
 SEEN: list[int] = []
 
