@@ -45,13 +45,7 @@ from numpy.typing import NDArray
 from benchmarks.table import show
 from semcal_ros.cli import main as semcal
 from semcal_ros.files.bags.writer import write_simulated
-from semcal_ros.synthetic import (
-    RecordingPlan,
-    calibration_plan,
-    drift_plan,
-    drift_preset,
-    preset,
-)
+from semcal_ros.synthetic import RecordingPlan, calibration_plan, drift_plan, drift_preset, preset
 from semcal_ros.synthetic.specimens.cantilever import CantileverPlan, cantilever_plan
 
 Images = Sequence[NDArray[Any]]

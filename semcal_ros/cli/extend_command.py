@@ -23,13 +23,7 @@ import click
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import PATH, output_option
-from semcal_ros.cli.output import (
-    echo_json,
-    echo_notes,
-    echo_table,
-    echo_verdict,
-    show_progress,
-)
+from semcal_ros.cli.output import echo_json, echo_notes, echo_table, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.ladder.extend import LadderStep

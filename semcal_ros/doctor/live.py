@@ -41,13 +41,7 @@ from semcal_ros.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.graph_checks import CONDITIONS, Topic
-from semcal_ros.doctor.observations import (
-    Arrival,
-    Endpoint,
-    Graph,
-    NodeStatus,
-    Session,
-)
+from semcal_ros.doctor.observations import Arrival, Endpoint, Graph, NodeStatus, Session
 from semcal_ros.doctor.stream_checks import describe_image
 from semcal_ros.middleware import message_class
 

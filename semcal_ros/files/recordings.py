@@ -41,10 +41,16 @@ from semcal_ros.core.calibration.thresholds import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.errors import reading
 from semcal_ros.files.bags.held_values import MagnificationTrack, find_conditions, find_stage
-from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
-from semcal_ros.files.bags.topics import find_image_topic, find_topic
+from semcal_ros.files.bags.reader import (
+    BagTopic,
+    RawMessage,
+    find_image_topic,
+    find_topic,
+    is_bag,
+    open_bag,
+    reading,
+)
 from semcal_ros.files.images.databar import DatabarFinder
 from semcal_ros.files.images.image_series import (
     ImageSeries,

@@ -33,8 +33,7 @@ from semcal_ros.bridge.conditions import CONDITIONS_TYPE
 from semcal_ros.bridge.fields import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, InvalidValueError, SemcalError
 from semcal_ros.files.bags.held_values import CONDITIONS_TOPIC
-from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag
-from semcal_ros.files.bags.topics import topic_matches
+from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag, topic_matches
 from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.endpoints import PatientPublisher

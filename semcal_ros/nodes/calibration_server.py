@@ -33,27 +33,18 @@ from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.acquisition import (
-    ViewRequest,
-)
+from semcal_ros.core.calibration.acquisition import ViewRequest
 from semcal_ros.core.calibration.judgement.check import Verdict
 from semcal_ros.core.calibration.options import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.errors import (
-    CalibrationError,
-    InvalidValueError,
-    Rejection,
-)
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.wording import counted
 from semcal_ros.nodes.acquisition.driver import AcquisitionDriver
 from semcal_ros.nodes.acquisition.ladder import LadderRun, place_of
-from semcal_ros.nodes.acquisition.run import (
-    ACQUISITION,
-    Progress,
-)
+from semcal_ros.nodes.acquisition.run import ACQUISITION, Progress
 from semcal_ros.nodes.calibration_state import (
     CalibrationState,
     CurrentState,

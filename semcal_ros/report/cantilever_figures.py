@@ -29,12 +29,7 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from semcal_ros.applications.cantilever import (
-    Deflection,
-    Repeatability,
-    Series,
-    group_frames,
-)
+from semcal_ros.applications.cantilever import Deflection, Repeatability, Series, group_frames
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.images.scale_bar import choose_scale_bar, format_length

@@ -37,13 +37,16 @@ from semcal_ros.synthetic.microscope import (
 from semcal_ros.synthetic.plans import (
     CALIBRATION_MAGNIFICATIONS,
     SPECIMEN_KINDS,
+    TRUTH_SCHEMA,
     PlannedFrame,
     RecordingPlan,
     calibration_plan,
     drift_plan,
     ladder_plan,
+    parameters_of,
     specimen_for,
     steps_plan,
+    truth_of,
     zoom_plan,
 )
 from semcal_ros.synthetic.pose import Pose, random_poses
@@ -68,7 +71,6 @@ from semcal_ros.synthetic.stage import (
     read_position,
 )
 from semcal_ros.synthetic.thresholds import SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M
-from semcal_ros.synthetic.truth import TRUTH_SCHEMA, parameters_of, truth_of
 
 __all__ = [
     "CALIBRATION_MAGNIFICATIONS",

@@ -37,11 +37,7 @@ from semcal_ros.core.calibration.options import (
 )
 from semcal_ros.core.calibration.pipeline import are_enough, calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.start import (
-    check_nominal_scale,
-    check_square_sides,
-    is_scale_far,
-)
+from semcal_ros.core.calibration.start import check_nominal_scale, check_square_sides, is_scale_far
 from semcal_ros.core.calibration.thresholds import VIEWS_MIN
 from semcal_ros.core.calibration.views import (
     FoundView,

@@ -49,12 +49,7 @@ from semcal_ros.synthetic import (
     truth_of,
     zoom_plan,
 )
-from semcal_ros.workflows.inputs import (
-    OnProgress,
-    check_positives,
-    count_frames,
-    ignore_progress,
-)
+from semcal_ros.workflows.inputs import OnProgress, check_positives, count_frames, ignore_progress
 from semcal_ros.workflows.options import OVERWRITE, PROGRESS, Keyword, KeywordsOf, Option
 
 #: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen beyond the

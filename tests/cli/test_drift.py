@@ -40,7 +40,7 @@ from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.video import VideoWriter
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.workflows.track_drift import describe_rate
-from tests.files.tiff.test_to_bag import write_tescan
+from tests.files.images.test_to_bag import write_tescan
 from tests.helpers.drift_scenes import make_drift_update
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run

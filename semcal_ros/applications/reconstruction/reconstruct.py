@@ -39,10 +39,7 @@ from semcal_ros.applications.reconstruction.patches import (
     measure_patches,
     project_to_plane_at_centre,
 )
-from semcal_ros.applications.reconstruction.surface import (
-    compute_spacing_m,
-    fit_local_surface,
-)
+from semcal_ros.applications.reconstruction.surface import compute_spacing_m, fit_local_surface
 from semcal_ros.applications.reconstruction.thresholds import POINT_MISFIT_MAX, WINDOW
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 from semcal_ros.core.arrays import Array, Image, Indices, Mask

@@ -34,12 +34,7 @@ from semcal_ros.core.calibration.acquisition import (
 )
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
-from semcal_ros.core.ladder.correspondences import (
-    PairFailure,
-    Prepared,
-    SmoothMap,
-    locate_picture,
-)
+from semcal_ros.core.ladder.correspondences import PairFailure, Prepared, SmoothMap, locate_picture
 from semcal_ros.core.ladder.extend import scale_of_pictures
 from semcal_ros.core.ladder.matching import LadderPicture, make_predictor
 from semcal_ros.core.ladder.thresholds import (

@@ -45,8 +45,7 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import FILE_NAMES
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.reader import BagReader, BagTopic, RawMessage
-from semcal_ros.files.bags.topics import topic_matches
+from semcal_ros.files.bags.reader import BagReader, BagTopic, RawMessage, topic_matches
 
 T = TypeVar("T")
 

@@ -47,12 +47,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from semcal_ros.bridge.calibration import fill_calibration_text
 from semcal_ros.bridge.camera import fill_camera_info, fill_projection, fill_stamped_projection
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions, fill_conditions
-from semcal_ros.bridge.drift import (
-    fill_drift,
-    fill_drift_velocity,
-    rotation_of,
-    rotation_rate_of,
-)
+from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity, rotation_of, rotation_rate_of
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig
@@ -61,7 +56,6 @@ from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.bags.errors import LIBRARY_ERRORS, one_line
 from semcal_ros.files.bags.held_values import CONDITIONS_TOPIC
 from semcal_ros.files.bags.messages import (
     blank_message,
@@ -74,6 +68,7 @@ from semcal_ros.files.bags.messages import (
     serialize_message,
     stage_message,
 )
+from semcal_ros.files.bags.reader import LIBRARY_ERRORS, one_line
 from semcal_ros.files.recordings import RecordedFrame
 
 if TYPE_CHECKING:

@@ -31,12 +31,7 @@ from semcal_ros.bridge.camera import (
     fill_stamped_projection,
     fill_stamped_projection_covariance,
 )
-from semcal_ros.bridge.drift import (
-    fill_drift,
-    fill_drift_velocity,
-    rotation_of,
-    rotation_rate_of,
-)
+from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity, rotation_of, rotation_rate_of
 from semcal_ros.bridge.fields import copy_header
 from semcal_ros.bridge.images import fill_image, pixel_memory
 from semcal_ros.core.camera.scan_camera import ScanCamera

@@ -32,12 +32,18 @@ from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.findings import compute_tilts_deg
 from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
+from semcal_ros.files.images.scale_bar import choose_scale_bar
 from semcal_ros.report.html.encode import convert_to_8_bits, encode_data_uri, encode_jpeg, shrink
 from semcal_ros.report.html.page import format_length, format_px, remove_control_characters
-from semcal_ros.report.html.scale_bar import DrawnScaleBar, draw_scale_bar
 from semcal_ros.report.html.style import choose_arrow_factor
+
+# Size of the type as a part of the width: legible where the picture is 390 px wide, and as a thumbnail of 200 px.
+_TYPE, _THUMBNAIL_TYPE = 0.042, 0.06
+# Distance of the bar from the edges, as a part of the width.
+_EDGE = 0.03
 
 # Width of a thumbnail with marks, px: two fit beside each other in the column of a page.
 _OVERLAY_WIDTH = 320
@@ -77,6 +83,72 @@ _MARK = 0.012
 _CROSSES = 6
 # Views whose corners move nearly as far as those of the best one: of them the coarsest grid is easiest to see.
 _NEARLY = 0.8
+
+
+@dataclass(frozen=True)
+class DrawnScaleBar:
+    """A bar and its label in the lower right corner of a picture.
+
+    Attributes
+    ----------
+    path
+        SVG path of the bar.
+    label
+        Its length with the 1-sigma.
+    pixel_size
+        The size of a pixel with the 1-sigma, for the caption.
+    x, y
+        Right lower end of the label.
+    type_px
+        Size of the type.
+    """
+
+    path: str
+    label: str
+    pixel_size: str
+    x: float
+    y: float
+    type_px: float
+
+
+def draw_scale_bar(
+    camera: ScanCamera, image_width_px: int, drawn_px: tuple[int, int], *, thumbnail: bool = False
+) -> DrawnScaleBar:
+    """Draw the bar of an image that is shown smaller than it is.
+
+    Parameters
+    ----------
+    camera
+        Camera of the image; its ``rectified`` one for a corrected image. In a raw image the bar is right at the
+        centre of the distortion.
+    image_width_px
+        Width of the image, which shows the camera's whole field.
+    drawn_px
+        (width, height) of the picture on the page.
+    thumbnail
+        Whether the type is to be legible in a small picture.
+    """
+    width, height = drawn_px
+    # An image of another size shows the same field.
+    size_m, sigma_m = _image_pixel(camera, camera.width / image_width_px)
+    shown_m, shown_sigma_m = _image_pixel(camera, camera.width / width)
+    bar = choose_scale_bar(width, shown_m, shown_sigma_m)
+    right, low = width * (1.0 - _EDGE), height - width * _EDGE
+    return DrawnScaleBar(
+        path=f"M{right - bar.length_px:.1f} {low:.1f}H{right:.1f}",
+        label=bar.label,
+        pixel_size=choose_scale_bar(image_width_px, size_m, sigma_m).pixel_size,
+        x=round(right, 1),
+        y=round(low - _EDGE * width / 2.0, 1),
+        type_px=round((_THUMBNAIL_TYPE if thumbnail else _TYPE) * width, 1),
+    )
+
+
+def _image_pixel(camera: ScanCamera, factor: float) -> tuple[float, float | None]:
+    """Width of a pixel that is ``factor`` of the camera's, and its 1-sigma where it is known."""
+    known = camera.covariance is not None
+    sigma_m = factor * float(camera.pixel_size_sigma_m[0]) if known else None
+    return factor * float(camera.pixel_size_m[0]), sigma_m
 
 
 @dataclass(frozen=True)
@@ -128,10 +200,6 @@ def _draw_squares(xy: Array, k: float) -> str:
     return "".join(f"M{x - k:.1f} {y - k:.1f}h{2 * k:.3g}v{2 * k:.3g}h{-2 * k:.3g}z" for x, y in xy)
 
 
-def _draw_found_crosses(xy: Array, k: float) -> str:
-    return "".join(f"M{x - k:.1f} {y:.1f}h{2 * k:.3g}m{-k:.3g} {-k:.3g}v{2 * k:.3g}" for x, y in xy)
-
-
 def overlay_corners(view: FoundView, model: CalibrationModel) -> Overlay:
     """Shrink a view, with a cross at each corner and a square at each refused one."""
     assert view.image is not None
@@ -150,7 +218,7 @@ def overlay_corners(view: FoundView, model: CalibrationModel) -> Overlay:
         src=encode_data_uri("jpeg", encode_jpeg(small, _EXAMPLE_QUALITY)),
         width=small.shape[1],
         height=small.shape[0],
-        marks=_draw_found_crosses(xy, size),
+        marks=_draw_crosses(xy, size),
         refused=_draw_squares(refused_xy, size),
         bar=_draw_bar(model, view, small),
         alt=f"Image at {view.magnification:g}x with {counted(count, 'corner')} of the grid marked by crosses",
@@ -481,10 +549,10 @@ def choose_blink(result: CalibrationResult, detections: Sequence[FoundView]) -> 
         return None
     least = _NEARLY * max(moved for moved, _, _ in moves)
     far = [move for move in moves if move[0] >= least]
-    return _make(result, *min(far, key=lambda move: len(result.views[move[1]].image_xy)))
+    return _make_blink(result, *min(far, key=lambda move: len(result.views[move[1]].image_xy)))
 
 
-def _make(result: CalibrationResult, moved_px: float, index: int, image: AnyImage) -> Blink:
+def _make_blink(result: CalibrationResult, moved_px: float, index: int, image: AnyImage) -> Blink:
     view = result.views[index]
     camera = result.model.at(view.magnification)
     raw = convert_to_8_bits(image)
@@ -505,14 +573,14 @@ def _make(result: CalibrationResult, moved_px: float, index: int, image: AnyImag
         corrected=_encode(corrected),
         width=width,
         height=height,
-        marks=_draw_crosses(_spread(at, width, height), _MARK * width),
+        marks=_draw_crosses(_spread_points(at, width, height), _MARK * width),
         bar=bar,
         alt=f"The view {name} at {view.magnification:g}x, raw and corrected",
-        caption=_describe(bar, f"{name}, {view.magnification:g}×", moved_px, nm),
+        caption=_describe_blink(bar, f"{name}, {view.magnification:g}×", moved_px, nm),
     )
 
 
-def _describe(bar: DrawnScaleBar, name: str, moved_px: float, moved: str) -> str:
+def _describe_blink(bar: DrawnScaleBar, name: str, moved_px: float, moved: str) -> str:
     return (
         f"{name}: the correction moves its corners by up to {moved_px:.2g} px, {moved}. The crosses stay: there, "
         f"corners of a flat, regular grid in this pose belong. {bar.pixel_size} in the corrected picture, to which "
@@ -520,7 +588,7 @@ def _describe(bar: DrawnScaleBar, name: str, moved_px: float, moved: str) -> str
     )
 
 
-def _spread(xy: Array, width: int, height: int) -> Array:
+def _spread_points(xy: Array, width: int, height: int) -> Array:
     """Choose points that are spread over the picture: the nearest to the middle of each cell."""
     known = xy[np.all(np.isfinite(xy), axis=1)]
     cell = width / _CROSSES

@@ -45,6 +45,7 @@ from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope, preset
+from semcal_ros.synthetic.plans import parameters_of
 from semcal_ros.synthetic.specimens.ray_lattice import RayLattice, trace_ray_lattice
 from semcal_ros.synthetic.specimens.thresholds import (
     BALL_MARGIN_M,
@@ -54,7 +55,6 @@ from semcal_ros.synthetic.specimens.thresholds import (
     BODY_TILE,
     GRAIN_VOXELS,
 )
-from semcal_ros.synthetic.truth import parameters_of
 
 #: Statistics of the texture: noise of two grain sizes; Voronoi cells, each of one brightness; bright cells
 #: with dark seams; a narrow band of wavelengths; bright spots on a dark ground.

@@ -21,12 +21,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from semcal_ros.applications.reconstruction import (
-    Observations,
-    Structure,
-    adjust,
-    fit_sphere,
-)
+from semcal_ros.applications.reconstruction import Observations, Structure, adjust, fit_sphere
 from semcal_ros.applications.reconstruction.ball import (
     Roundness,
     _quadrics,

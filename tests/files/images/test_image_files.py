@@ -24,7 +24,6 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
-from tests.files.tiff.test_to_bag import write_tescan
 
 from semcal_ros.config import load_config
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -32,6 +31,7 @@ from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError
 from semcal_ros.core.rectification.line_phase import estimate_line_phase
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, open_recording
 from semcal_ros.files.video import open_video
+from tests.files.images.test_to_bag import write_tescan
 
 CONFIG = load_config("generic")
 RNG = np.random.default_rng(0)

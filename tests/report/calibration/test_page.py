@@ -52,15 +52,7 @@ from semcal_ros.report.calibration.view_pictures import (
 )
 from semcal_ros.report.html import encode
 from semcal_ros.report.html.page import format_px, write_page
-from tests.helpers.report_samples import (
-    DISPLAY_M,
-    HOSTILE,
-    SIZE,
-    Page,
-    found_of,
-    grid_view,
-    unused,
-)
+from tests.helpers.report_samples import DISPLAY_M, HOSTILE, SIZE, Page, found_of, grid_view, unused
 
 pytestmark = pytest.mark.slow
 
