@@ -42,7 +42,7 @@ from sensor_msgs.msg import Image
 WRITER = """
 import sys, time
 from pathlib import Path
-from benchmarks.folder.__main__ import save
+from benchmarks.folder import save
 folder, count, rate, side = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
 begun = time.time()
 for number in range(count):

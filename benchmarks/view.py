@@ -45,7 +45,7 @@ from benchmarks.live.scenes import calibration, pictures
 from benchmarks.table import quick_from_command_line, show
 from examples.live_nodes import LiveNodes
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY = Path(__file__).resolve().parents[1]
 MAGNIFICATION = 5000.0
 SIZE, RATE_HZ = 512, 20.0
 TIMEOUT_S = 30.0
