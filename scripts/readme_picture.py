@@ -31,7 +31,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from semcal_ros import Calibration, calibrate, rectify
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.files.images.scale_bar import ScaleBar, choose_scale_bar
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.workflows.simulate import simulate

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.views import GridView

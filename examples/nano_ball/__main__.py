@@ -45,7 +45,7 @@ from examples.nano_ball.looks import compare_looks, slow_down
 from semcal_ros import Calibration
 from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe
 from semcal_ros.cli import main as semcal
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.files.bags.writer import SIMULATED_START_NS, write_simulated
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.report.html.encode import encode_png

@@ -51,7 +51,7 @@ from joblib import Parallel, cpu_count, delayed
 from examples.visual_servo.loop import Case, Run, Task, servo_run
 from semcal_ros import Calibration
 from semcal_ros.applications.servoing import PlanePose, ServoSettings
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import UnusableCalibrationError

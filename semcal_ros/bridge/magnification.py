@@ -28,7 +28,7 @@ from numbers import Real
 from typing import Any
 
 from semcal_ros.bridge.fields import optional_stamp_ns
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
 MAGNIFICATION_LIMITS = (1.0, 1e8)

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from semcal_ros.bridge.fields import require_fields
-from semcal_ros.config import StageConfig
+from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import MessageError
 

@@ -26,7 +26,7 @@ import click
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import config_option, options_of, refuse_with, require_folder
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.ladder.acquisition import plan_ladder

@@ -36,7 +36,7 @@ from semcal_ros.cli.output import (
     show_progress,
 )
 from semcal_ros.cli.recording_input import PIXEL_SIZE_AT, check_outputs, recording_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.options import MethodOptions
 from semcal_ros.core.calibration.paper.pda import focal_length_and_skew, prime
 from semcal_ros.core.corners import PATTERN_NAMES, describe_odds

@@ -35,7 +35,7 @@ from semcal_ros.cli.output import (
     show_progress,
 )
 from semcal_ros.cli.recording_input import recording_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Change, Verdict
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles

@@ -23,7 +23,7 @@ import click
 from semcal_ros.cli.options import PATH, overwrite_option
 from semcal_ros.cli.output import show_progress
 from semcal_ros.cli.recording_input import recording_input, refuse_mask
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.files.images.to_bag import import_images
 from semcal_ros.files.recordings import RecordedFiles
 

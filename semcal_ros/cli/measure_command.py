@@ -27,7 +27,7 @@ from semcal_ros.applications.cantilever import group_frames
 from semcal_ros.cli.options import FIGURE_SUFFIXES, options_of
 from semcal_ros.cli.output import echo_notes, echo_paths, echo_table, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recordings_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.files.images.write import PixelScale
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tables import TABLE_SUFFIXES

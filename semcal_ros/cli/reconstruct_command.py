@@ -28,7 +28,7 @@ from semcal_ros.applications.reconstruction.tilt_series import HeightMap
 from semcal_ros.cli.options import options_of
 from semcal_ros.cli.output import echo_json, echo_notes, echo_paths, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.wording import counted
 from semcal_ros.files.meshes import MESH_SUFFIXES, UNITS_PER_M
 from semcal_ros.files.recordings import RecordedFiles

@@ -24,7 +24,7 @@ import click
 from semcal_ros.cli.options import options_of
 from semcal_ros.cli.output import echo_notes, echo_states, show_progress
 from semcal_ros.cli.recording_input import check_spared, recording_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.rectify import RectifyOptions, rectify_recording

@@ -31,7 +31,7 @@ from semcal_ros.cli.output import (
     show_progress,
 )
 from semcal_ros.cli.recording_input import check_outputs, recording_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.scan_pairs import ScanPairDrift
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES

@@ -25,7 +25,7 @@ from semcal_ros.cli.check_command import echo_check
 from semcal_ros.cli.options import PATH, options_of, output_option
 from semcal_ros.cli.output import echo_notes, echo_rejected, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import UpdateOptions, update_by_recording
 

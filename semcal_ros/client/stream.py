@@ -24,12 +24,12 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
-from semcal_ros.bridge.camera import (
+from semcal_ros.bridge.fields import stamp_ns_from_msg
+from semcal_ros.bridge.projection import (
     stamped_projection_covariance_from_message,
     stamped_projection_from_message,
 )
-from semcal_ros.bridge.fields import stamp_ns_from_msg
-from semcal_ros.config import MicroscopeConfig, load_config
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibrated_frame import CalibratedFrame, describe_missing_camera
 from semcal_ros.nodes.common.context import NodeContext

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from semcal_ros.bridge.continuous_parameters import continuous_value
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig, load_config
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.environment_checks import (
     ENVIRONMENT_CHECKS,

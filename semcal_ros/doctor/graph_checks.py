@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
-from semcal_ros.config import MicroscopeConfig, StageConfig
+from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.observations import Endpoint, Graph
 

@@ -37,7 +37,7 @@ from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.graph_checks import CONDITIONS, Topic

@@ -27,7 +27,7 @@ from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.bridge.magnification import read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig, load_config
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.errors import MessageError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import judge_calibrations

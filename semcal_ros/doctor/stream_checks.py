@@ -25,7 +25,7 @@ from typing import Any
 
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.bridge.stage import missing_joints
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import describe_condition
 from semcal_ros.core.errors import SemcalError

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.drivers.folder import FolderSource, default_journal
 from semcal_ros.drivers.openfibsem import OpenFibsemSource, require_fibsem

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.stage import doubt_unit
-from semcal_ros.config import StageConfig
+from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import MicroscopeError, SemcalError, UnusableFrameError
 from semcal_ros.drivers.source import SourceFrame

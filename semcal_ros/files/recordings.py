@@ -34,7 +34,7 @@ from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.fields import require_fields, stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
-from semcal_ros.config import MagnificationConfig, MicroscopeConfig, load_config
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.arrays import Mask, check_range
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.thresholds import DISPLAY_WIDTH_LIMITS_M

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.acquisition import (
     ViewRequest,
     find_picture_fault,

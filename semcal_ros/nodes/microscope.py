@@ -34,7 +34,7 @@ from semcal_ros.bridge.conditions import fill_conditions
 from semcal_ros.bridge.fields import fill_header, fill_stamp, optional_stamp_ns
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import published_number
-from semcal_ros.config import IMAGE_TYPE, MicroscopeConfig
+from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig
 from semcal_ros.core.errors import ConfigError, MicroscopeError, SemcalError
 from semcal_ros.drivers.choose import SOURCES, make_source
 from semcal_ros.drivers.health import FrameWatch

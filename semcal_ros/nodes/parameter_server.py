@@ -27,7 +27,9 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64MultiArray, Header, String
 
-from semcal_ros.bridge.camera import (
+from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
+from semcal_ros.bridge.magnification import MagnificationReading
+from semcal_ros.bridge.projection import (
     StaticFrame,
     fill_camera_info,
     fill_projection,
@@ -35,8 +37,6 @@ from semcal_ros.bridge.camera import (
     fill_static_frames,
     static_frames,
 )
-from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
-from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import ConfigError, InvalidValueError, SemcalError
 from semcal_ros.middleware import message_class

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.drivers.source import FrameSource
 from semcal_ros.nodes.common.run import run_node, run_parts
 from semcal_ros.nodes.microscope import Microscope

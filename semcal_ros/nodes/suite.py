@@ -29,7 +29,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.calibrated_frame import CalibratedFrame
 from semcal_ros.core.errors import ConfigError, InvalidValueError
 from semcal_ros.core.wording import nearest_name

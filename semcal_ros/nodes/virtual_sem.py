@@ -32,7 +32,7 @@ from semcal_ros.bridge.conditions import fill_conditions
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import check_magnification
-from semcal_ros.config import IMAGE_TYPE
+from semcal_ros.config.config import IMAGE_TYPE
 from semcal_ros.core.errors import ConfigError, MicroscopeError, SemcalError
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.motion import MotionInterface, motion_with

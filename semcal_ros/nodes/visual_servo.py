@@ -47,15 +47,15 @@ from semcal_ros.applications.servoing import (
     choose_projection,
     find_target,
 )
-from semcal_ros.bridge.camera import (
-    projection_from_message,
-    stamped_projection_covariance_from_message,
-    stamped_projection_from_message,
-)
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.fields import copy_header, stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.bridge.magnification import MagnificationReading
+from semcal_ros.bridge.projection import (
+    projection_from_message,
+    stamped_projection_covariance_from_message,
+    stamped_projection_from_message,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.context import NodeContext

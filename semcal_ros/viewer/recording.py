@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.drift.estimates import DriftEstimate, DriftUpdate
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.rectification.rectifier import Rectifier

@@ -24,7 +24,7 @@ import numpy as np
 
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.findings import find_all

@@ -22,7 +22,7 @@ from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.check import CalibrationCheck, check_calibration
 from semcal_ros.core.calibration.judgement.thresholds import DEFAULT_AGEING
 from semcal_ros.core.calibration.judgement.update import CalibrationUpdate, update_calibration

@@ -22,6 +22,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tifffile
 
@@ -40,6 +41,7 @@ from semcal_ros.files.foreign_cameras import (
 )
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
 from semcal_ros.workflows.describe_camera import parameter_sigma
+from semcal_ros.workflows.options import KeywordsOf, Option
 
 #: Formats, and the suffixes of their files.
 EXPORT_FORMATS = {
@@ -77,14 +79,36 @@ class ExportedCamera:
     rms_px: float = 0.0
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """Which camera is written, and how near it must be."""
+
+    magnifications: Annotated[
+        Sequence[float],
+        Option(
+            "The camera at this magnification; for csv as often as wanted (default: the calibrated ones).",
+            names=("--magnification",),
+            repeated=True,
+            metavar="G",
+        ),
+    ] = ()
+    rectified: Annotated[
+        bool, Option("The camera of rectified images, which every format holds exactly.")
+    ] = False
+    lossy_px: Annotated[
+        float,
+        Option(
+            "Refuse a format that is further from the calibration than this somewhere in the image.",
+            between=(0.0, None),
+            metavar="PX",
+            python="In px.",
+        ),
+    ] = LOSSY_PX
+
+
+@KeywordsOf(ExportOptions)
 def export_calibration(
-    calibration: Calibration,
-    kind: str,
-    path: str | os.PathLike[str],
-    *,
-    magnifications: Sequence[float] = (),
-    rectified: bool = False,
-    lossy_px: float = LOSSY_PX,
+    calibration: Calibration, kind: str, path: str | os.PathLike[str], options: ExportOptions
 ) -> ExportedCamera:
     """Write a calibration as a file of another program.
 
@@ -99,12 +123,6 @@ def export_calibration(
         parameters and their 1-sigma over the magnification.
     path
         The file to write.
-    magnifications
-        One for a camera; for ``"csv"`` as many as wanted, the calibrated ones by default.
-    rectified
-        The camera of rectified images, which all formats hold, instead of that of raw ones.
-    lossy_px
-        Largest distance in px that the model in the file may have from the calibration.
 
     Raises
     ------
@@ -115,6 +133,11 @@ def export_calibration(
         If a file cannot be written.
     """
     file = Path(path)
+    magnifications, rectified, lossy_px = (
+        options.magnifications,
+        options.rectified,
+        options.lossy_px,
+    )
     _check(kind, file, magnifications, rectified=rectified)
     if kind == "csv":
         _write_parameters(calibration, magnifications or calibration.magnifications, file)

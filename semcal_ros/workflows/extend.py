@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.records import Provenance

@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath, DriftSettings, DriftUpdate
@@ -70,7 +70,7 @@ class DriftFollower:
         Whether to keep the data for smoothing; without them only the current drift is known.
     follow
         The part of the pictures that shows the specimen, as in a
-        :class:`~semcal_ros.config.MicroscopeConfig`.
+        :class:`~semcal_ros.config.config.MicroscopeConfig`.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig, load_config
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.core.arrays import check_positive
 from semcal_ros.core.camera.calibration_model import checked_magnification
 from semcal_ros.core.camera.scan_timing import ScanTiming

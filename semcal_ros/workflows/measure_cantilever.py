@@ -37,7 +37,7 @@ from semcal_ros.applications.cantilever import (
 )
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame

@@ -31,7 +31,7 @@ from typing import Any
 import semcal_ros
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.camera.records import Provenance

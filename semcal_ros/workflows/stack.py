@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage, Mask, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming

@@ -27,7 +27,7 @@ import numpy as np
 
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.estimates import DriftEstimate, DriftPath, DriftPredictor
 from semcal_ros.core.errors import BagError

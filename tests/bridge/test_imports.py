@@ -37,7 +37,7 @@ import semcal_ros.bridge
 
 for module in pkgutil.iter_modules(semcal_ros.bridge.__path__, "semcal_ros.bridge."):
     importlib.import_module(module.name)
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 
 assert load_config("generic").name == "generic"
 """

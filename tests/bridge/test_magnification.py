@@ -26,7 +26,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semcal_ros.bridge.magnification import read_magnification
-from semcal_ros.config import MicroscopeConfig, load_config, parse_config
+from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.bags.messages import blank_message
 

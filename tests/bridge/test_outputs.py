@@ -31,7 +31,6 @@ from semcal_ros.bridge.calibration import (
     calibration_text_from_message,
     fill_calibration_text,
 )
-from semcal_ros.bridge.camera import fill_camera_info, fill_projection, projection_from_message
 from semcal_ros.bridge.drift import (
     UNKNOWN_VARIANCE,
     fill_drift,
@@ -46,6 +45,7 @@ from semcal_ros.bridge.fields import (
     optional_stamp_ns,
     stamp_ns_from_msg,
 )
+from semcal_ros.bridge.projection import fill_camera_info, fill_projection, projection_from_message
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.camera import (
+from semcal_ros.bridge.projection import (
     fill_camera_info,
     fill_projection,
     fill_projection_covariance,

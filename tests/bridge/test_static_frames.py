@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.camera import fill_static_frames, static_frames
-from semcal_ros.config import load_config
+from semcal_ros.bridge.projection import fill_static_frames, static_frames
+from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.nodes import parameter_server as output

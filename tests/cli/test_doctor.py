@@ -29,7 +29,7 @@ import pytest
 
 from semcal_ros.bridge.magnification import MagnificationReading
 from semcal_ros.cli import main
-from semcal_ros.config import MagnificationConfig, MicroscopeConfig, StageConfig
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.doctor import environment_checks as checks
 from semcal_ros.doctor.diagnosis import check_calibration, describe_calibration, evaluate

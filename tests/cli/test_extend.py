@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from semcal_ros import Calibration, extend
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.synthetic import preset

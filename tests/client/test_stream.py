@@ -27,8 +27,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 
-from semcal_ros.bridge.camera import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.bridge.drift import fill_drift
+from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
 from semcal_ros.client import CalibratedFrame, CalibratedStream
 from semcal_ros.client.stream import _explain
 from semcal_ros.core.camera.scan_camera import ScanCamera

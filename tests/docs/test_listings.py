@@ -24,7 +24,7 @@ from pathlib import Path
 import click
 import pytest
 
-from semcal_ros.config import parse_config
+from semcal_ros.config.config import parse_config
 from semcal_ros.nodes.common.base import node_class
 from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
 from tests.helpers.listings import listings

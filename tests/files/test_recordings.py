@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.config import ImageConfig, MagnificationConfig, MicroscopeConfig
+from semcal_ros.config.config import ImageConfig, MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.reader import BagTopic, find_topic, topic_matches

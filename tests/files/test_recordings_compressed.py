@@ -28,7 +28,12 @@ from semcal_ros.bridge.compressed import fill_compressed
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import ENCODINGS, fill_image
 from semcal_ros.cli.main import main
-from semcal_ros.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig, MicroscopeConfig
+from semcal_ros.config.config import (
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    ImageConfig,
+    MicroscopeConfig,
+)
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter

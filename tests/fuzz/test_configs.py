@@ -29,7 +29,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from semcal_ros.bridge.magnification import read_magnification
-from semcal_ros.config import (
+from semcal_ros.config.config import (
     MicroscopeConfig,
     config_directories,
     find_config_file,

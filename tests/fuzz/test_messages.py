@@ -31,13 +31,6 @@ from semcal_ros.bridge.calibration import (
     calibration_text_from_message,
     fill_calibration_text,
 )
-from semcal_ros.bridge.camera import (
-    fill_camera_info,
-    fill_projection,
-    fill_stamped_projection,
-    projection_from_message,
-    stamped_projection_from_message,
-)
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
 from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.images import (
@@ -48,7 +41,14 @@ from semcal_ros.bridge.images import (
     without_databar,
 )
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
-from semcal_ros.config import MagnificationConfig, MicroscopeConfig
+from semcal_ros.bridge.projection import (
+    fill_camera_info,
+    fill_projection,
+    fill_stamped_projection,
+    projection_from_message,
+    stamped_projection_from_message,
+)
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message

@@ -23,7 +23,7 @@ from typing import Any
 
 from rclpy.clock import Clock
 
-from semcal_ros.config import MicroscopeConfig, load_config
+from semcal_ros.config.config import MicroscopeConfig, load_config
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.reporter import Reporter
 

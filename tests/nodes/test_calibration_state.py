@@ -28,7 +28,7 @@ import pytest
 
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.acquisition import ViewRequest
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading

@@ -29,7 +29,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from semcal_ros.bridge.compressed import fill_compressed, image_from_compressed
 from semcal_ros.bridge.images import image_from_message
-from semcal_ros.config import COMPRESSED_IMAGE_TYPE, load_config
+from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, load_config
 from tests.helpers.node_scenes import image_message, stamp_of, texture
 from tests.helpers.ros_process import PATIENT, RELIABLE, NodeProcess, Peer, running
 

@@ -23,7 +23,7 @@ import pytest
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, Float64MultiArray
 
-from semcal_ros.bridge.camera import (
+from semcal_ros.bridge.projection import (
     projection_covariance_from_message,
     stamped_projection_covariance_from_message,
     stamped_projection_from_message,

@@ -31,13 +31,13 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, Float64MultiArray
 
-from semcal_ros.bridge.camera import (
+from semcal_ros.bridge.drift import fill_drift
+from semcal_ros.bridge.projection import (
     fill_camera_info,
     fill_projection,
     fill_stamped_projection,
     fill_stamped_projection_covariance,
 )
-from semcal_ros.bridge.drift import fill_drift
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.scan_timing import ScanTiming

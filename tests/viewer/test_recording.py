@@ -26,7 +26,7 @@ import pytest
 import tifffile
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import RecordedFiles, open_recording
 from semcal_ros.viewer.recording import RecordingSource

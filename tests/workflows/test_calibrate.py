@@ -26,7 +26,7 @@ import pytest
 from semcal_ros import Calibration, calibrate
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.config import StageConfig, StageSigmas, load_config
+from semcal_ros.config.config import StageConfig, StageSigmas, load_config
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageAxis, StageReading
 from semcal_ros.core.camera.records import Provenance

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure

@@ -26,8 +26,8 @@ import tifffile
 
 import semcal_ros
 from semcal_ros import calibrate, measure_cantilever, reconstruct, rectify, stack, track_drift
-from semcal_ros.bridge.camera import stamped_projection_from_message
-from semcal_ros.config import load_config
+from semcal_ros.bridge.projection import stamped_projection_from_message
+from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.records import FitRecord
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.reader import open_bag

@@ -24,7 +24,7 @@ import pytest
 
 from semcal_ros import Calibration
 from semcal_ros.bridge.conditions import Conditions
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
 from semcal_ros.workflows.inputs import resolve_config

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from semcal_ros import calibrate
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording

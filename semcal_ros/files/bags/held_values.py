@@ -40,7 +40,7 @@ from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.stage import doubt_unit, missing_joints, read_stage, tilt_jump_rad
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
-from semcal_ros.config import MicroscopeConfig, StageConfig
+from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import FILE_NAMES
 from semcal_ros.core.errors import SemcalError

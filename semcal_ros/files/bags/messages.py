@@ -27,7 +27,7 @@ from rosbags.typesys.store import Typestore
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions, fill_conditions
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.magnification import published_number
-from semcal_ros.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig, StageConfig
+from semcal_ros.config.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError
 

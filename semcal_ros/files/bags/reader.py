@@ -54,7 +54,7 @@ from rosbags.typesys import (
 from rosbags.typesys.store import Typestore
 from ruamel.yaml.error import YAMLError
 
-from semcal_ros.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
+from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
 from semcal_ros.core.errors import BagError, CalibrationFileError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.messages import jazzy_types

@@ -45,12 +45,12 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from semcal_ros.bridge.calibration import fill_calibration_text
-from semcal_ros.bridge.camera import fill_camera_info, fill_projection, fill_stamped_projection
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions, fill_conditions
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity, rotation_of, rotation_rate_of
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig
+from semcal_ros.bridge.projection import fill_camera_info, fill_projection, fill_stamped_projection
+from semcal_ros.config.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_camera import ScanCamera

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.stage import doubt_unit
-from semcal_ros.config import StageConfig
+from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError, SemcalError, UnknownScaleError
 from semcal_ros.core.wording import counted, omit_numbers

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions
 from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.config import IMAGE_TYPE, MicroscopeConfig, StageConfig, load_config
+from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig, StageConfig, load_config
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.bags.held_values import CONDITIONS_TOPIC

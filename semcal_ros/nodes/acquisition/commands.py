@@ -27,7 +27,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
-from semcal_ros.config import StageConfig
+from semcal_ros.config.config import StageConfig
 from semcal_ros.core.errors import MicroscopeError
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import latched

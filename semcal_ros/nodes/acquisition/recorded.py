@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import LatticeDetection, find_lattice

@@ -37,7 +37,7 @@ from semcal_ros.bridge.diagnostics import (
     join_states,
     split_states,
 )
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.wording import nearest_name
 from semcal_ros.nodes.common.command_line import EXECUTABLES, HelpWanted, command_line, is_quality
 from semcal_ros.nodes.common.context import NodeContext

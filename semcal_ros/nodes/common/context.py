@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.nodes.common.endpoints import Endpoints
 from semcal_ros.nodes.common.parameters import Parameters
 from semcal_ros.nodes.common.reporter import Reporter

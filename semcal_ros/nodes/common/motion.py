@@ -25,7 +25,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
-from semcal_ros.config import StageConfig
+from semcal_ros.config.config import StageConfig
 from semcal_ros.core.errors import MicroscopeError, SemcalError
 from semcal_ros.drivers.limits import MotionLimits, describe_target, joint_unit
 from semcal_ros.drivers.source import JOINTS

@@ -32,7 +32,7 @@ from semcal_ros.bridge.calibration import (
     read_scale_warnings,
 )
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import read_calibration_text

@@ -30,7 +30,7 @@ from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Verdict
 from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice

@@ -29,7 +29,7 @@ from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.camera.records import NOT_RECORDED
 from semcal_ros.core.errors import SemcalError

@@ -25,15 +25,15 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from semcal_ros.bridge.camera import (
+from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity, rotation_of, rotation_rate_of
+from semcal_ros.bridge.fields import copy_header
+from semcal_ros.bridge.images import fill_image, pixel_memory
+from semcal_ros.bridge.projection import (
     fill_camera_info,
     fill_raw_camera_info,
     fill_stamped_projection,
     fill_stamped_projection_covariance,
 )
-from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity, rotation_of, rotation_rate_of
-from semcal_ros.bridge.fields import copy_header
-from semcal_ros.bridge.images import fill_image, pixel_memory
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier

@@ -32,7 +32,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.fields import stamp_ns_from_msg
-from semcal_ros.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
+from semcal_ros.config.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError

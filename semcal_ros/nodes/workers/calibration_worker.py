@@ -29,7 +29,7 @@ import numpy as np
 
 from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.plan import judge_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView

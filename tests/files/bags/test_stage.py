@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.config import MicroscopeConfig, StageConfig
+from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.files.bags.messages import blank_message

@@ -25,7 +25,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError
 from semcal_ros.core.rectification.line_phase import estimate_line_phase

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from semcal_ros.config import MagnificationConfig, MicroscopeConfig, load_config
+from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.bags.reader import open_bag

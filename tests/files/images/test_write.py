@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from semcal_ros.config import load_config
+from semcal_ros.config.config import load_config
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.images.write import (
     PixelScale,

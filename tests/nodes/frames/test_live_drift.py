@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
-from semcal_ros.config import MicroscopeConfig, load_config, parse_config
+from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.frames.compressed import compressed_parameters

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 from sensor_msgs.msg import JointState
 
-from semcal_ros.config import MicroscopeConfig, StageConfig, load_config
+from semcal_ros.config.config import MicroscopeConfig, StageConfig, load_config
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.nodes.frames.stage import StageInput
 from tests.helpers.node_fakes import FakeEndpoints, fake_context, fake_reporter, notes

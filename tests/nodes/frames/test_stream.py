@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.config import ImageConfig, load_config
+from semcal_ros.config.config import ImageConfig, load_config
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.line_phase import estimate_line_phase

@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 import yaml
 
-from semcal_ros.config import (
+from semcal_ros.config.config import (
     COMPRESSED_IMAGE_TYPE,
     IMAGE_TYPE,
     IMAGE_TYPES,
@@ -43,7 +43,7 @@ from semcal_ros.config import (
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 
-CONFIGS = Path(__file__).resolve().parents[1] / "msg_configs"
+CONFIGS = Path(__file__).resolve().parents[2] / "msg_configs"
 
 GOOD = """
 name: test

@@ -39,7 +39,7 @@ from semcal_ros.bridge.fields import (
     whole_number,
 )
 from semcal_ros.bridge.images import PixelFormat, fill_image, image_from_message
-from semcal_ros.config import MicroscopeConfig
+from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import MessageError
@@ -82,7 +82,7 @@ def fill_camera_info(
         The camera of this image, in any size: it is resized to the image's. None means
         uncalibrated; a parallel projection (``rho <= 0`` or only slightly above) has no finite K
         either. Both leave K, R and P zero, which sensor_msgs defines as "uncalibrated"; the affine-safe matrix of
-        :mod:`semcal_ros.bridge.camera` still describes a parallel projection.
+        :mod:`semcal_ros.bridge.projection` still describes a parallel projection.
     header
         Header of the image, copied verbatim.
     width, height

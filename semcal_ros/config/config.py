@@ -99,31 +99,41 @@ def _sort_largest_first(sizes: tuple[float, ...]) -> tuple[float, ...]:
 # `strict`: no text for a number and no bool for an integer.
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
+
 _Whole = BeforeValidator(_read_whole)
+
 
 # 255 characters are the longest name that DDS takes.
 _Name = Annotated[str, Field(strict=True, min_length=1, max_length=255)]
+
 
 _Topic = Annotated[
     _Name, Field(pattern=r"^(~/|/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$")
 ]
 
+
 _Type = Annotated[_Name, Field(pattern=r"^[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*$")]
+
 
 _FieldPath = Annotated[
     _Name,
     Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\[[0-9]+\])?(\.[A-Za-z_][A-Za-z0-9_]*(\[[0-9]+\])?)*$"),
 ]
 
+
 _Frame = Annotated[_Name, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_/-]*$")]
+
 
 # Upper limits of lengths and times only catch a wrong unit: nothing real comes near them.
 _DisplayWidth = Annotated[_Number, Field(gt=0.0, le=100.0)]
 
+
 _SquareSize = Annotated[_Number, Field(gt=0.0, le=1.0)]
+
 
 # A stage that is known to no better than half a radian or ten millimetres is not known at all.
 _AngleSigma = Annotated[_Number, Field(gt=0.0, le=0.5)]
+
 
 _LengthSigma = Annotated[_Number, Field(gt=0.0, le=0.01)]
 
@@ -134,7 +144,9 @@ _Part = Annotated[_Number, Field(ge=0.0, le=1.0)]
 
 _FILE = ConfigDict(extra="forbid")
 
+
 _TOPIC = "a ROS topic name such as image_raw"
+
 
 _JOINT = "the name of a joint such as tilt"
 
@@ -425,14 +437,17 @@ _MAPPINGS: dict[str, Any] = {
     "stage.sigma": StageSigmas,
 }
 
+
 # A file has to say these although the classes have defaults: a number of another quantity looks
 # much like a magnification.
 _REQUIRED = {"": "magnification", "magnification": "quantity"}
+
 
 _UNKNOWN = ("unexpected_keyword_argument", "invalid_key")
 
 
 Location = tuple[str | int, ...]
+
 
 #: What is wrong at which key: pydantic's type of error, and the value.
 Problems = dict[Location, tuple[str, Any]]
@@ -455,7 +470,7 @@ def load_config(name_or_path: str | Path) -> MicroscopeConfig:
     ----------
     name_or_path
         Path of a YAML file, or the bare name of one that is shipped (``"jsm820"``; see
-        :func:`~semcal_ros.config.config_names`).
+        :func:`~semcal_ros.config.config.config_names`).
 
     Raises
     ------
@@ -601,7 +616,7 @@ def config_directories() -> tuple[Path, ...]:
 
 
 def _list_candidates() -> Iterator[Path]:
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     yield package.parent / "msg_configs"
     yield package / "msg_configs"
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
