@@ -36,7 +36,7 @@ from semcal_ros.synthetic.specimens.cantilever import (
     cantilever_plan,
     random_cantilever,
 )
-from semcal_ros.synthetic.specimens.thresholds import CANTILEVER_PUSHES
+from semcal_ros.synthetic.thresholds import CANTILEVER_PUSHES
 
 HEADERS = ["scene", "tip", "substrate", "beam", "push nm"]
 FIGURES = ["spread nm", "error nm RMS", "largest nm", "sigma nm", "error/sigma", "refused"]

@@ -60,7 +60,6 @@ from semcal_ros.synthetic.specimens.grid import (
     Specimen,
     square_for,
 )
-from semcal_ros.synthetic.specimens.thresholds import SQUARES_M
 from semcal_ros.synthetic.stage import (
     STAGES,
     SimulatedStage,
@@ -70,7 +69,11 @@ from semcal_ros.synthetic.stage import (
     pose_on_stage,
     read_position,
 )
-from semcal_ros.synthetic.thresholds import SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M
+from semcal_ros.synthetic.thresholds import (
+    SIMULATED_VOLTAGE_V,
+    SIMULATED_WORKING_DISTANCE_M,
+    SQUARES_M,
+)
 
 __all__ = [
     "CALIBRATION_MAGNIFICATIONS",

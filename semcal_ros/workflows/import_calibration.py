@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Annotated
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.camera.nominal_calibration import KnownPixelSize, make_nominal_calibration
+from semcal_ros.core.camera.calibration_model import KnownPixelSize, make_nominal_calibration
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tables import read_table
 from semcal_ros.workflows.options import KeywordsOf, Option

@@ -47,7 +47,7 @@ from semcal_ros.synthetic import (
     truth_of,
 )
 from semcal_ros.synthetic.detector import _shift_lines
-from semcal_ros.synthetic.specimens.ray_lattice import trace_ray_lattice
+from semcal_ros.synthetic.render import trace_ray_lattice
 from semcal_ros.synthetic.stage import ActuatorFaults, StageActuator, visit_scales
 
 ONE_AXIS, TWO_AXIS = STAGES["one-axis"], STAGES["two-axis"]

@@ -62,7 +62,7 @@ LENS_TOLERANCE = TABLE.derived(
     "Of the last step: some ninety roundings of a coordinate of order one, 2^-53.",
 )
 
-# Nominal calibrations, in nominal_calibration.py
+# Nominal calibrations, in calibration_model.py
 
 CONTRADICTION_SIGMAS = TABLE.derived(
     "CONTRADICTION_SIGMAS", 3.0, "sigma",

@@ -26,8 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices, Mask
-from semcal_ros.core.corners.lattice import Lattice, enlarged
-from semcal_ros.core.corners.saddle import LatticeStatus
+from semcal_ros.core.corners.lattice import Lattice, LatticeStatus, enlarged
 from semcal_ros.core.corners.spectrum import (
     clip_levels,
     compute_spectrum,

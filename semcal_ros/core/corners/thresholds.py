@@ -29,7 +29,7 @@ TABLE = Table()
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
-# Saddle points, in saddle.py
+# Saddle points, in lattice.py
 
 SADDLE_THRESHOLD = TABLE.derived(
     "SADDLE_THRESHOLD", 0.1, "of the strong response",

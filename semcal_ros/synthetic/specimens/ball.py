@@ -46,8 +46,8 @@ from semcal_ros.synthetic.detector import Detector
 from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope, preset
 from semcal_ros.synthetic.plans import parameters_of
-from semcal_ros.synthetic.specimens.ray_lattice import RayLattice, trace_ray_lattice
-from semcal_ros.synthetic.specimens.thresholds import (
+from semcal_ros.synthetic.render import RayLattice, trace_ray_lattice
+from semcal_ros.synthetic.thresholds import (
     BALL_MARGIN_M,
     BALL_SAMPLES,
     BODY_ROOM,

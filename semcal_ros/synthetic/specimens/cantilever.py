@@ -40,7 +40,7 @@ from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
-from semcal_ros.synthetic.specimens.thresholds import (
+from semcal_ros.synthetic.thresholds import (
     CANTILEVER_MAGNIFICATIONS,
     CANTILEVER_PUSHES,
     FREE_GAP_M,
