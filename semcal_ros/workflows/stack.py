@@ -47,7 +47,7 @@ from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.images.scale_bar import choose_scale_bar
 from semcal_ros.files.images.write import IMAGE_SUFFIXES, TIFF_SUFFIXES, pixel_scale, write_image
 from semcal_ros.files.recordings import RecordedFrame, Recording
-from semcal_ros.files.video import FPS_RANGE, check_video, open_video, shade
+from semcal_ros.files.video import BLACK_WHITE, FPS_RANGE, check_video, open_video, shade
 from semcal_ros.workflows.follow_drift import (
     DriftFollower,
     camera_for,
@@ -79,9 +79,6 @@ from semcal_ros.workflows.workers import open_workers
 
 # Magnifications that an error lists: as many as fit two lines of a terminal.
 _LISTED = 12
-# Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a
-# thousand may be clipped at either end.
-_BLACK_WHITE = (0.001, 0.999)
 # Step between the pixels of a row and between the rows that are used for an image's quantiles.
 _SPARSE = 4
 
@@ -304,7 +301,7 @@ def _estimate_black_white(frame: RecordedFrame) -> tuple[float, float]:
     values = frame.image[::_SPARSE, ::_SPARSE]
     if values.dtype.kind == "f":
         values = values[np.isfinite(values)]
-    low, high = np.quantile(values, _BLACK_WHITE) if values.size else (0.0, 1.0)
+    low, high = np.quantile(values, BLACK_WHITE) if values.size else (0.0, 1.0)
     return float(low), float(high)
 
 

@@ -36,7 +36,7 @@ from semcal_ros.files.images.scale_bar import choose_scale_bar
 from semcal_ros.files.images.write import pixel_scale
 from semcal_ros.files.recordings import Recording
 from semcal_ros.files.tables import DRIFT_COLUMNS, SIMILARITY_COLUMNS, write_table
-from semcal_ros.files.video import open_video, shade
+from semcal_ros.files.video import BLACK_WHITE, open_video, shade
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     DriftFollower,
@@ -57,9 +57,6 @@ from semcal_ros.workflows.inputs import (
 )
 from semcal_ros.workflows.options import CONFIG, FRAME_TIME, PROGRESS, KeywordsOf, Option
 
-# Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a thousand
-# may be clipped at either end.
-_BLACK_WHITE = (0.001, 0.999)
 # Black columns between both pictures.
 _GAP_PX = 4
 
@@ -305,7 +302,7 @@ def write_drift_video(
         height, width = grey.shape
         levels = (0.0, 255.0)
         if grey.dtype != np.uint8:
-            low, high = np.quantile(grey[np.isfinite(grey)], _BLACK_WHITE)
+            low, high = np.quantile(grey[np.isfinite(grey)], BLACK_WHITE)
             levels = float(low), float(high)
         size = (2 * width + _GAP_PX, height)
         advance = count_frames(on_progress, "video", len(track))

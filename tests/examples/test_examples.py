@@ -31,8 +31,7 @@ import yaml
 
 from examples.cantilever.figure_16a import SCALES, compare_calibrations, root_mean_square_nm
 from semcal_ros.files.bags.writer import SIMULATED_START_NS
-from tests.helpers.listings import listings, run_page
-from tests.helpers.notebooks import follow_notebook
+from tests.helpers.listings import follow_notebook, listings, run_page
 from tests.helpers.ros_domain import claim_domain
 
 # They make their recordings and calibrations themselves.

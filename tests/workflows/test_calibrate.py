@@ -43,8 +43,7 @@ from semcal_ros.workflows.calibrate import (
     options_for,
 )
 from semcal_ros.workflows.find_grid import collect_views, count_visits, find_views
-from tests.helpers.corner_boards import Board
-from tests.helpers.dot_grids import PatternBoard
+from tests.helpers.grids import Board, PatternBoard
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 PLAN = calibration_plan(

@@ -43,7 +43,7 @@ from semcal_ros.workflows import workers as module
 from semcal_ros.workflows.evaluate import evaluate
 from semcal_ros.workflows.find_grid import find_views
 from semcal_ros.workflows.workers import Workers, count_bytes, open_workers
-from tests.helpers.corner_boards import Board
+from tests.helpers.grids import Board
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import run
 from tests.helpers.turning_ball import turning_ball
