@@ -24,7 +24,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_prefix
 
-from semcal_ros.middleware.ament_prefix import add_environment_prefix
+from semcal_ros.middleware import add_environment_prefix
 
 END_S = 60.0
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")

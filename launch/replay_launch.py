@@ -21,12 +21,7 @@ ros2 launch semcal_ros replay_launch.py --show-args
 from pathlib import Path
 
 from launch import LaunchDescription  # isort: skip - this folder has the same name
-from launch.actions import (
-    OpaqueFunction,
-    SetLaunchConfiguration,
-    Shutdown,
-    TimerAction,
-)
+from launch.actions import OpaqueFunction, SetLaunchConfiguration, Shutdown, TimerAction
 from launch.conditions import IfCondition
 from launch.launch_description_sources import load_python_launch_file_as_module
 from launch.substitutions import LaunchConfiguration

@@ -44,8 +44,7 @@ import click
 from semcal_ros import _HOMES  # the public names, with the modules that define them
 from semcal_ros.cli.main import _COMMANDS  # no public name lists them with their summaries
 from semcal_ros.nodes.common.base import node_class
-from semcal_ros.nodes.common.command_line import HelpWanted, starting_with
-from semcal_ros.nodes.common.help import EXECUTABLES
+from semcal_ros.nodes.common.command_line import EXECUTABLES, HelpWanted, starting_with
 from semcal_ros.nodes.common.parameters import DIRECTORY, ParameterDeclaration
 from semcal_ros.workflows.options import OptionField, option_fields
 

@@ -79,7 +79,7 @@ def _isolate() -> int:
     ):
         os.environ.pop(name, None)
     # As the executables do. Imported here: numpy must not be loaded before the variables above are set.
-    from semcal_ros.middleware.ament_prefix import add_environment_prefix
+    from semcal_ros.middleware import add_environment_prefix
 
     add_environment_prefix()
     return lock

@@ -25,11 +25,11 @@ from matplotlib.figure import Figure
 
 from semcal_ros import Calibration, SemcalError
 from semcal_ros.core.calibration.pipeline import calibrate_views
-from semcal_ros.core.camera.ladder_record import LadderRecord
+from semcal_ros.core.camera.records import LadderRecord
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.calibration.curves import parts_by_specimen
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.node_scenes import make_calibration, texture
 
 MICROSCOPE = preset("jsm820")

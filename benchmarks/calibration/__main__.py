@@ -45,14 +45,7 @@ from benchmarks.calibration.cases import (
     simulated,
 )
 from benchmarks.calibration.corners import corners
-from benchmarks.calibration.methods import (
-    JOINT,
-    JOINT_FIELD,
-    METHODS,
-    Judged,
-    Work,
-    judged,
-)
+from benchmarks.calibration.methods import JOINT, JOINT_FIELD, METHODS, Judged, Work, judged
 from benchmarks.table import quick_from_command_line, show, text
 
 Results = Mapping[str, Judged]

@@ -42,7 +42,7 @@ from scipy.special import erf
 
 from benchmarks.table import show
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.predicted_error import predict_aligned_sigma_px
+from semcal_ros.core.camera.uncertainty import predict_aligned_sigma_px
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.workflows.calibrate import calibrate_found
 

@@ -49,11 +49,11 @@ from benchmarks.table import show
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
-from semcal_ros.core.camera.predicted_error import predict_aligned_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty import predict_aligned_sigma_px
 from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
 from semcal_ros.core.ladder.matching import LadderPicture
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 __all__ = ["Case", "compare", "draw_case", "record"]
 

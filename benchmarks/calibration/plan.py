@@ -46,7 +46,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
-from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
+from semcal_ros.core.camera.uncertainty import worst_pixel_size
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import stage_views
 

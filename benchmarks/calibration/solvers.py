@@ -55,10 +55,7 @@ from semcal_ros.core.calibration.estimator.blocks import (
 )
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine, refit_functions
 from semcal_ros.core.calibration.estimator.poses import thin_view
-from semcal_ros.core.calibration.estimator.problem import (
-    Setup,
-    build_problem,
-)
+from semcal_ros.core.calibration.estimator.problem import Setup, build_problem
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
     prior_cost,

@@ -33,14 +33,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.drift import methods as drift_methods
 from benchmarks.drift import raster as drift_raster
-from benchmarks.drift import scores as drift_scores
 from benchmarks.drift.methods import (
     METHODS,
     PREDICTION_PX,
     UNIT,
+    WRONG_PX,
     Answer,
     Method,
+    Score,
     phase_correlate_pictures,
 )
 from benchmarks.drift.pairs import (
@@ -52,7 +54,6 @@ from benchmarks.drift.pairs import (
     large_shifts,
     small_shifts,
 )
-from benchmarks.drift.scores import WRONG_PX, Score
 from benchmarks.live.scenes import pictures
 from benchmarks.table import interleaved, quick_from_command_line, show
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -99,7 +100,7 @@ def scores(pairs: list[Pair]) -> list[Score]:
 
     times = interleaved({method.name: next_pair(method) for method in able}, len(pairs))
     return [
-        drift_scores.score(m, pairs, answers[m.name], times[m.name] / times[UNIT])
+        drift_methods.score(m, pairs, answers[m.name], times[m.name] / times[UNIT])
         if m.run is not None
         else Score(m)
         for m in METHODS
@@ -122,11 +123,11 @@ def table(group: Group, kind: str) -> list[list[Score]]:
         # Another noise for every specimen, or chance would favour the same method in all of them.
         seed = (group.size, group.large, KINDS.index(kind), round(db), group.bits)
         out.append(scores(views.pairs(db, group.bits, PREDICTION_PX, seed)))
-        rows += drift_scores.rows(out[-1], f"{db:g} dB")
+        rows += drift_methods.rows(out[-1], f"{db:g} dB")
     show(
         f"Registration, {kind}, {group.size} x {group.size}, {group.bits} bits, shifts up to"
         f" {reach:.0f} px, {group.pairs} pairs",
-        drift_scores.HEADER,
+        drift_methods.HEADER,
         rows,
     )
     return out
@@ -204,8 +205,8 @@ def main() -> None:
             groups += table(group, kind)
     show(
         "Registration, all of the above",
-        drift_scores.SUMMARY_HEADER,
-        drift_scores.summary(groups),
+        drift_methods.SUMMARY_HEADER,
+        drift_methods.summary(groups),
         "groups: specimens, noises, sizes and ranges of shifts. RMS/bound, err/sigma, time and cost:",
         "medians over the groups in which the method does not fail; worst: the largest RMS/bound.",
     )

@@ -54,7 +54,7 @@ from examples.cantilever.figure_16a import (
     show_comparison,
 )
 from examples.cantilever.scenes import measure_scenes
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.files.bags.writer import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import (
     STAGES,
     TYPICAL_GRID,
@@ -66,7 +66,7 @@ from semcal_ros.synthetic import (
     truth_of,
 )
 from semcal_ros.synthetic.specimens.cantilever import CantileverPlan, cantilever_plan
-from semcal_ros.synthetic.specimens.thresholds import CANTILEVER_MAGNIFICATIONS, CANTILEVER_PUSHES
+from semcal_ros.synthetic.thresholds import CANTILEVER_MAGNIFICATIONS, CANTILEVER_PUSHES
 
 GRID = (100, 250, 600, 1200, 2500, 4000, 5500, 7000, 8500, 10000)
 QUICK_GRID = (1500, 4000, 7000, 10000)

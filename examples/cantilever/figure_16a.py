@@ -32,7 +32,7 @@ from matplotlib.ticker import MaxNLocator
 
 from semcal_ros.cli.output import echo_table
 from semcal_ros.core.arrays import Array
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS
+from semcal_ros.files.bags.writer import SIMULATED_START_NS
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     ACCENT,

@@ -31,12 +31,12 @@ from semcal_ros.cli.output import echo_table
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.synthetic import VirtualMicroscope
-from semcal_ros.synthetic.specimens.cantilever import cantilever_plan
-from semcal_ros.synthetic.specimens.cantilever_random import (
+from semcal_ros.synthetic.specimens.cantilever import (
     CantileverExperiment,
+    cantilever_plan,
     random_cantilever,
 )
-from semcal_ros.synthetic.specimens.thresholds import CANTILEVER_PUSHES
+from semcal_ros.synthetic.thresholds import CANTILEVER_PUSHES
 
 HEADERS = ["scene", "tip", "substrate", "beam", "push nm"]
 FIGURES = ["spread nm", "error nm RMS", "largest nm", "sigma nm", "error/sigma", "refused"]

@@ -30,9 +30,8 @@ from numpy.typing import NDArray
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.images.scale_bar import choose_scale_bar, draw_scale_bar, format_length
 from semcal_ros.report.html.encode import Picture, encode_figure, encode_pictures
-from semcal_ros.report.html.page import render, write_page
+from semcal_ros.report.html.page import format_px, remove_control_characters, render, write_page
 from semcal_ros.report.html.style import INK, OURS, REFERENCE, add_legend, create_figure, style_axes
-from semcal_ros.report.html.text import format_px, remove_control_characters
 
 __all__ = ["DemoRow", "overlay_change", "write_correction_report"]
 

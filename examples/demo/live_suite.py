@@ -30,7 +30,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray
 
 from examples.live_nodes import LiveNodes
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message
 
 NODES = ("parameter_server", "drift_compensator", "stream_corrector")

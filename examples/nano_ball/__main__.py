@@ -46,7 +46,7 @@ from semcal_ros import Calibration
 from semcal_ros.applications.reconstruction import SequenceTracker, TrackKeyframe
 from semcal_ros.cli import main as semcal
 from semcal_ros.config.config import load_config
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.files.bags.writer import SIMULATED_START_NS, write_simulated
 from semcal_ros.files.recordings import open_recording
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import INK, OURS, SECOND, add_color_bar, create_figure, style_axes

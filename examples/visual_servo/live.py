@@ -46,7 +46,7 @@ from semcal_ros.applications.servoing import (
     find_target,
     fit_pose,
 )
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.images import image_from_message
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import VirtualMicroscope

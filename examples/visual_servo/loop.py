@@ -34,7 +34,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import LiveScene, Pose, VirtualMicroscope, drift_preset
-from semcal_ros.synthetic.actuator import ActuatorFaults, StageActuator
+from semcal_ros.synthetic.stage import ActuatorFaults, StageActuator
 
 # Between the end of a frame and the moment from which the stage obeys: transport and work.
 LATENCY_S = 0.1

@@ -26,7 +26,7 @@ from joblib import Parallel, cpu_count, delayed
 from examples.visual_servo.loop import Case, Run, Task, servo_run
 from semcal_ros.applications.servoing import NestedTarget, PlanePose, find_target
 from semcal_ros.synthetic import Pose, VirtualMicroscope
-from semcal_ros.synthetic.actuator import ActuatorFaults
+from semcal_ros.synthetic.stage import ActuatorFaults
 
 FRAMES = 40
 LAST = 5

@@ -34,8 +34,8 @@ from rclpy.qos import QoSProfile
 from examples.live_nodes import LiveNodes
 from examples.visual_servo.loop import LATENCY_S, Run
 from semcal_ros.applications.servoing import PlanePose
-from semcal_ros.bridge.headers import stamp_ns_from_msg
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS, write_simulated
+from semcal_ros.bridge.fields import stamp_ns_from_msg
+from semcal_ros.files.bags.writer import SIMULATED_START_NS, write_simulated
 from semcal_ros.synthetic import VirtualMicroscope
 
 SILENCE_S = 5.0

@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.codec_headers import CodecHeader, read_codec_header
-from semcal_ros.bridge.fields import assign_bytes, require_fields
-from semcal_ros.bridge.headers import HeaderMessage, copy_header
+from semcal_ros.bridge.fields import HeaderMessage, assign_bytes, copy_header, require_fields
 from semcal_ros.bridge.images import ENCODINGS, image_from_message
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.core.wording import did_you_mean

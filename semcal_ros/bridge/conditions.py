@@ -12,15 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Operating conditions as a diagnostic_msgs/msg/DiagnosticStatus: text keys and values in SI units."""
+"""Operating conditions: how an image was taken, and as a diagnostic_msgs/msg/DiagnosticStatus with values in SI."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from datetime import datetime
 from typing import Any
 
 from semcal_ros.bridge.fields import new_nested, require_fields
+from semcal_ros.core.camera.conditions import FILE_NAMES
 
 NUMBERS = (
     "accelerating_voltage_v",
@@ -40,6 +43,72 @@ CONDITIONS_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
 
 # A detector has a name of a few words; what is longer is something else.
 _LONGEST = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """How an image was taken, in SI units; None, or an empty text, where a file does not say it.
+
+    Parameters
+    ----------
+    maker
+        ``zeiss``, ``thermo_fisher``, ``tescan``, ``jeol``, ``hitachi``, ``phenom``, ``olympus`` or, for a copy that
+        ImageJ saved without the maker's metadata, ``imagej``.
+    model, serial_number
+        Name and serial number of the microscope.
+    detector
+        Detector or signal.
+    beam
+        ``electron`` or ``ion``.
+    acceleration_voltage_v
+        Acceleration voltage, without its sign.
+    working_distance_m
+        Working distance.
+    beam_current_a
+        Current of the beam on the specimen.
+    scan_rotation_rad, stage_tilt_rad, stage_rotation_rad
+        Angles in the maker's sense of rotation.
+    dwell_s
+        Time on each pixel in one pass.
+    frame_time_s
+        Time of one pass over the frame.
+    frame_interval_s
+        Time from one page of the file to the next.
+    time
+        Local time of the recording, without a time zone.
+    """
+
+    maker: str = ""
+    model: str = ""
+    serial_number: str = ""
+    detector: str = ""
+    beam: str = ""
+    acceleration_voltage_v: float | None = None
+    working_distance_m: float | None = None
+    beam_current_a: float | None = None
+    scan_rotation_rad: float | None = None
+    stage_tilt_rad: float | None = None
+    stage_rotation_rad: float | None = None
+    dwell_s: float | None = None
+    frame_time_s: float | None = None
+    frame_interval_s: float | None = None
+    time: datetime | None = None
+
+    def conditions(self) -> dict[str, Any]:
+        """All conditions by name as plain values for JSON."""
+        values = {item.name: getattr(self, item.name) for item in fields(Conditions)}
+        return {**values, "time": None if self.time is None else self.time.isoformat()}
+
+    def topic_values(self) -> dict[str, float | str]:
+        """What is known of what the topic ``conditions`` tells, by its keys."""
+        found = {key: getattr(self, FILE_NAMES.get(key, key)) for key in (*NUMBERS, *TEXTS)}
+        return {key: value for key, value in found.items() if value not in (None, "")}
+
+    @classmethod
+    def from_topic(cls, values: Mapping[str, float | str]) -> Conditions:
+        """Make them of the values of the topic ``conditions``; other keys are left out."""
+        known = {FILE_NAMES.get(k, k): v for k, v in values.items() if k in (*NUMBERS, *TEXTS)}
+        return Conditions(**known)  # type: ignore[arg-type]
 
 
 def fill_conditions(message: Any, conditions: Mapping[str, float | str], name: str = "") -> None:

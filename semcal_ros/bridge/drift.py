@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.bridge.fields import assign_floats
-from semcal_ros.bridge.headers import HeaderMessage, copy_header
+from semcal_ros.bridge.fields import HeaderMessage, assign_floats, copy_header
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 

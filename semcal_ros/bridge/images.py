@@ -25,8 +25,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.fields import byte_memory, require_fields, whole_number
-from semcal_ros.bridge.headers import HeaderMessage, copy_header
+from semcal_ros.bridge.fields import (
+    HeaderMessage,
+    byte_memory,
+    copy_header,
+    require_fields,
+    whole_number,
+)
 from semcal_ros.core.errors import InvalidValueError, MessageError
 
 

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, MessageError
 

@@ -29,7 +29,7 @@ from semcal_ros.cli.options import config_option, options_of, refuse_with, requi
 from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.core.ladder.plan import plan_ladder
+from semcal_ros.core.ladder.acquisition import plan_ladder
 from semcal_ros.workflows.options import Option
 
 

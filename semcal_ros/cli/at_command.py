@@ -17,61 +17,65 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import HEIGHT, LENGTH, PATH, json_option
+from semcal_ros.cli.options import PATH, json_option, options_of
 from semcal_ros.cli.output import echo_json, echo_notes, echo_table
-from semcal_ros.core.camera.provenance import NOT_RECORDED
+from semcal_ros.core.camera.records import NOT_RECORDED
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.term_sizes import has_terms, measure_along_axes
-from semcal_ros.core.camera.uncertainty_budget import (
+from semcal_ros.core.camera.uncertainty import (
     UncertaintyBudget,
     budget_of_length,
     budget_of_pixel_size,
 )
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.workflows.describe_camera import describe_camera
+from semcal_ros.workflows.options import Option
+
+
+@dataclass(frozen=True)
+class AtOptions:
+    """What is told, instead of the camera."""
+
+    budget: Annotated[
+        bool, Option("What the uncertainty of nm per pixel consists of, instead.")
+    ] = False
+    length_m: Annotated[
+        float | None,
+        Option("With --budget: that of a length in the image, such as 10um.", kind="length"),
+    ] = None
+    edge_sigma_px: Annotated[
+        float,
+        Option(
+            "With --length: 1-sigma of the position of each of its ends, px.",
+            between=(0.0, None),
+            metavar="PX",
+        ),
+    ] = 0.5
+    height_m: Annotated[
+        float | None,
+        Option(
+            "nm per pixel at this height above the plane of the calibration, away from the pole piece.",
+            kind="height",
+        ),
+    ] = None
 
 
 @click.command("at")
 @click.argument("calibration", type=PATH)
 @click.argument("magnification", type=float)
-@click.option(
-    "--budget", is_flag=True, help="What the uncertainty of nm per pixel consists of, instead."
-)
-@click.option(
-    "--length",
-    type=LENGTH,
-    metavar="LENGTH",
-    help="With --budget: that of a length in the image, such as 10um.",
-)
-@click.option(
-    "--edge-sigma",
-    type=click.FloatRange(min=0.0),
-    default=0.5,
-    show_default=True,
-    metavar="PX",
-    help="With --length: 1-sigma of the position of each of its ends, px.",
-)
-@click.option(
-    "--height",
-    type=HEIGHT,
-    default="0",
-    metavar="LENGTH",
-    help="nm per pixel at this height above the plane of the calibration, away from the pole piece.",
-)
+@options_of(AtOptions)
 @json_option
 def command(
     calibration: Path,
     magnification: float,
-    budget: bool,
-    length: float | None,
-    edge_sigma: float,
-    height: float,
+    options: AtOptions,
     as_json: bool,
 ) -> None:
     """Camera of CALIBRATION at MAGNIFICATION: K, P, distortion, nm per pixel, with uncertainty.
@@ -82,17 +86,22 @@ def command(
       semcal at cal.yaml 5250 --budget --length 10um
     """
     model = Calibration.load(calibration)
-    if not budget and length is not None:
+    length_m, height_m = options.length_m, options.height_m or 0.0
+    if not options.budget and length_m is not None:
         raise InvalidValueError("--length without --budget", expected="both, or neither")
-    if budget or height:
+    if options.budget or height_m:
         found = (
-            budget_of_pixel_size(model, magnification, height_m=height)
-            if length is None
+            budget_of_pixel_size(model, magnification, height_m=height_m)
+            if length_m is None
             else budget_of_length(
-                model, magnification, length, edge_sigma_px=edge_sigma, height_m=height
+                model,
+                magnification,
+                length_m,
+                edge_sigma_px=options.edge_sigma_px,
+                height_m=height_m,
             )
         )
-        _echo_budget(found, of_length=length is not None, as_json=as_json)
+        _echo_budget(found, of_length=length_m is not None, as_json=as_json)
         if model.scale_sigma.grid == 0.0:
             echo_notes(
                 [

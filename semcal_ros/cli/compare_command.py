@@ -17,12 +17,14 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import FIGURE_SUFFIXES, PATH, json_option
+from semcal_ros.cli.options import FIGURE_SUFFIXES, PATH, json_option, options_of
 from semcal_ros.cli.output import echo_json, echo_notes, echo_paths, echo_table
 from semcal_ros.core.calibration.judgement.compare import (
     CalibrationDifference,
@@ -30,6 +32,7 @@ from semcal_ros.core.calibration.judgement.compare import (
 )
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
+from semcal_ros.workflows.options import Option
 
 _COLUMNS = (
     "magnification",
@@ -42,27 +45,33 @@ _COLUMNS = (
 )
 
 
+@dataclass(frozen=True)
+class CompareOptions:
+    """Where two calibrations are compared, and what is written."""
+
+    magnifications: Annotated[
+        tuple[float, ...],
+        Option(
+            "Compare at this magnification, as often as wanted (default: seven over the common range).",
+            names=("--magnification",),
+            repeated=True,
+            metavar="G",
+        ),
+    ] = ()
+    table: Annotated[
+        Path | None, Option("The table as .csv, .parquet or .xlsx.", kind="path of a file")
+    ] = None
+    figure: Annotated[
+        Path | None, Option("A picture as .png, .svg or .pdf.", kind="path of a file")
+    ] = None
+
+
 @click.command("compare")
 @click.argument("first", type=PATH)
 @click.argument("second", type=PATH)
-@click.option(
-    "--magnification",
-    type=float,
-    multiple=True,
-    metavar="G",
-    help="Compare at this magnification, as often as wanted (default: seven over the common range).",
-)
-@click.option("--table", type=PATH, metavar="FILE", help="The table as .csv, .parquet or .xlsx.")
-@click.option("--figure", type=PATH, metavar="FILE", help="A picture as .png, .svg or .pdf.")
+@options_of(CompareOptions)
 @json_option
-def command(
-    first: Path,
-    second: Path,
-    magnification: tuple[float, ...],
-    table: Path | None,
-    figure: Path | None,
-    as_json: bool,
-) -> None:
+def command(first: Path, second: Path, options: CompareOptions, as_json: bool) -> None:
     """By how much the calibration SECOND differs from FIRST, in px and nm, over its joint sigma.
 
     Exit status: 0 they agree, 1 they differ, 2 bad input.
@@ -71,6 +80,7 @@ def command(
     Example:
       semcal compare january.yaml june.yaml --figure difference.png
     """
+    table, figure = options.table, options.figure
     for option, path, suffixes in (
         ("--table", table, TABLE_SUFFIXES),
         ("--figure", figure, FIGURE_SUFFIXES),
@@ -80,7 +90,7 @@ def command(
                 f"{option} {path}", expected="a name that ends in " + ", ".join(suffixes)
             )
     calibrations = Calibration.load(first), Calibration.load(second)
-    difference = compare_calibrations(*calibrations, magnification)
+    difference = compare_calibrations(*calibrations, options.magnifications)
     rows = _tabulate(difference)
     if table is not None:
         write_table(table, _COLUMNS, rows)

@@ -17,54 +17,49 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
 
-from semcal_ros.bridge.names import absolute_namespace
-from semcal_ros.cli.options import PATH, Quantity, config_option
+from semcal_ros.bridge.fields import absolute_namespace
+from semcal_ros.cli.options import PATH, config_option, json_option, options_of
 from semcal_ros.cli.output import echo_json
 from semcal_ros.core.wording import counted
 from semcal_ros.doctor.diagnosis import diagnose
 from semcal_ros.doctor.findings import CheckResult, Severity, explain_figures
 from semcal_ros.doctor.recording import diagnose_recording
 from semcal_ros.files.images.image_series import refuse_images
+from semcal_ros.workflows.options import Option
 
 _ORDER = (Severity.PROBLEM, Severity.NOTE, Severity.OK)
+
+
+@dataclass(frozen=True)
+class DoctorOptions:
+    """Where to look, and for how long."""
+
+    calibration: Annotated[
+        Path | None,
+        Option(
+            "Calibration to check, instead of the one on the topic `calibration`.",
+            kind="path of a file",
+        ),
+    ] = None
+    namespace: Annotated[str, Option("Namespace of the suite's nodes and topics.")] = "/sem"
+    seconds: Annotated[
+        float,
+        Option("How long to listen; choose more than one frame takes.", kind="time to listen"),
+    ] = 3.0
 
 
 @click.command("doctor")
 @click.argument("recording", type=PATH, required=False)
 @config_option
-@click.option(
-    "--calibration",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Calibration to check, instead of the one on the topic `calibration`.",
-)
-@click.option(
-    "--namespace",
-    default="/sem",
-    show_default=True,
-    help="Namespace of the suite's nodes and topics.",
-)
-@click.option(
-    "--seconds",
-    type=Quantity("time", "s", "3s or 500ms", within=(0.1, 3600.0)),
-    default="3s",
-    show_default=True,
-    metavar="TIME",
-    help="How long to listen; choose more than one frame takes.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def command(
-    recording: Path | None,
-    config: str,
-    calibration: Path | None,
-    namespace: str,
-    seconds: float,
-    as_json: bool,
-) -> None:
+@options_of(DoctorOptions)
+@json_option
+def command(recording: Path | None, config: str, options: DoctorOptions, as_json: bool) -> None:
     """Look for what keeps a live stream from working, or is wrong with a RECORDING, and say what to do.
 
     One line for each check, problems first: problem, note or ok. The exit status is 1 if there is a problem.
@@ -75,10 +70,11 @@ def command(
       semcal doctor recording --calibration cal.yaml
     """
     if recording is None:
-        found = diagnose(config, calibration, absolute_namespace(namespace), seconds)
+        namespace = absolute_namespace(options.namespace)
+        found = diagnose(config, options.calibration, namespace, options.seconds)
     else:
         refuse_images(recording)
-        found = diagnose_recording(recording, config, calibration)
+        found = diagnose_recording(recording, config, options.calibration)
     if as_json:
         echo_json({"findings": [_as_dict(finding) for finding in found], **_count_levels(found)})
     else:

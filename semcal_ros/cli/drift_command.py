@@ -36,13 +36,13 @@ from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.tables import TABLE_SUFFIXES
 from semcal_ros.files.video import FPS_RANGE, VIDEO_CODECS
-from semcal_ros.workflows.drift_video import write_drift_video
 from semcal_ros.workflows.options import Option
 from semcal_ros.workflows.track_drift import (
     DriftOptions,
     describe_forecast,
     describe_rate,
     track_recording,
+    write_drift_video,
 )
 
 

@@ -22,9 +22,9 @@ from pathlib import Path
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import PATH
+from semcal_ros.cli.options import PATH, options_of, output_option
 from semcal_ros.cli.output import echo_notes
-from semcal_ros.workflows.export_camera import EXPORT_FORMATS, LOSSY_PX, export_calibration
+from semcal_ros.workflows.export_camera import EXPORT_FORMATS, ExportOptions, export_calibration
 
 # Above this, the difference is told as a note: a tenth of a pixel is what users of such files see.
 _TOLD_PX = 0.1
@@ -39,35 +39,9 @@ _TOLD_PX = 0.1
     required=True,
     help="Which program.",
 )
-@click.option("-o", "--output", type=PATH, required=True, help="File to write.")
-@click.option(
-    "--magnification",
-    type=float,
-    multiple=True,
-    metavar="G",
-    help="The camera at this magnification; for csv as often as wanted (default: the calibrated ones).",
-)
-@click.option(
-    "--rectified",
-    is_flag=True,
-    help="The camera of rectified images, which every format holds exactly.",
-)
-@click.option(
-    "--lossy",
-    type=click.FloatRange(min=0.0),
-    default=LOSSY_PX,
-    show_default=True,
-    metavar="PX",
-    help="Refuse a format that is further from the calibration than this somewhere in the image.",
-)
-def command(
-    calibration: Path,
-    kind: str,
-    output: Path,
-    magnification: tuple[float, ...],
-    rectified: bool,
-    lossy: float,
-) -> None:
+@output_option("File to write.")
+@options_of(ExportOptions)
+def command(calibration: Path, kind: str, output: Path, options: ExportOptions) -> None:
     """CALIBRATION as a file of another program: OpenCV, ROS, mrcal, COLMAP, Fiji, or a table.
 
     \b
@@ -76,9 +50,7 @@ def command(
       semcal export cal.yaml --format csv -o parameters.csv
     """
     model = Calibration.load(calibration)
-    done = export_calibration(
-        model, kind, output, magnifications=magnification, rectified=rectified, lossy_px=lossy
-    )
+    done = export_calibration(model, kind, output, **vars(options))
     for path in done.paths:
         click.echo(f"{kind}: {path}")
     if done.worst_px > 0.0:

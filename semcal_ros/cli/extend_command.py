@@ -22,14 +22,8 @@ from pathlib import Path
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import PATH, output_option
-from semcal_ros.cli.output import (
-    echo_json,
-    echo_notes,
-    echo_table,
-    echo_verdict,
-    show_progress,
-)
+from semcal_ros.cli.options import PATH, json_option, output_option
+from semcal_ros.cli.output import echo_json, echo_notes, echo_table, echo_verdict, show_progress
 from semcal_ros.cli.recording_input import check_outputs, recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.ladder.extend import LadderStep
@@ -47,7 +41,7 @@ _MOST_NAMED = 3
 @click.argument("calibration", type=PATH)
 @recording_input
 @output_option("Extended calibration file.")
-@click.option("--json", "as_json", is_flag=True, help="What was found, as JSON.")
+@json_option
 def command(
     calibration: Path,
     recording: RecordedFiles,

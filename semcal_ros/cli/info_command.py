@@ -28,7 +28,7 @@ from semcal_ros.cli.output import echo_json, echo_notes, echo_table, show_progre
 from semcal_ros.cli.recording_input import recording_input, refuse_mask
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.conditions import describe_condition, format_time
-from semcal_ros.core.camera.provenance import NOT_RECORDED
+from semcal_ros.core.camera.records import NOT_RECORDED
 from semcal_ros.core.wording import counted, printable
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.describe_calibration import describe_calibration

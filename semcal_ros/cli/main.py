@@ -25,7 +25,7 @@ import click
 import semcal_ros
 from semcal_ros.core.errors import SemcalError, UnusableCalibrationError
 from semcal_ros.core.wording import did_you_mean
-from semcal_ros.middleware.ament_prefix import add_environment_prefix
+from semcal_ros.middleware import add_environment_prefix
 
 # Modules are imported when their command is used, so that `semcal --help` does not wait for plotting or bags.
 _COMMANDS = {

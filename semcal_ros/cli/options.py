@@ -20,7 +20,7 @@ import math
 import re
 import types
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, dataclass, replace
+from dataclasses import MISSING, dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin
@@ -28,10 +28,9 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 import click
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.tiff.values import angle_in_degrees, plain_number, quantity
+from semcal_ros.files.images.metadata import angle_in_degrees, plain_number, quantity
 from semcal_ros.workflows.options import (
     OVERWRITE,
-    SQUARES,
     Keyword,
     Option,
     OptionField,
@@ -123,11 +122,6 @@ config_option = click.option(
 )
 
 
-def squares_option(text: str) -> Callable[[Command], Command]:
-    """``--squares`` with its help text."""
-    return make_option(OptionField("squares", Any, None, replace(SQUARES, text=text)))
-
-
 def parse_lengths(
     _context: click.Context, parameter: click.Parameter, text: str | None
 ) -> tuple[float, ...] | None:
@@ -167,18 +161,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, 
 def output_option(text: str) -> Callable[[Command], Command]:
     """The required ``-o`` with its help text."""
     return click.option("-o", "--output", required=True, type=PATH, help=text)
-
-
-def calibration_option(
-    text: str | None = None, *, required: bool = False
-) -> Callable[[Command], Command]:
-    """``--calibration`` with its help text."""
-    return click.option("--calibration", type=PATH, required=required, help=text)
-
-
-def no_drift_option(text: str) -> Callable[[Command], Command]:
-    """``--no-drift`` with its help text."""
-    return click.option("--no-drift", is_flag=True, help=text)
 
 
 def parse_ratio(
@@ -392,6 +374,13 @@ def _parse_length_in_picture(
     return (float(LENGTH.convert(length, parameter, context)), picture, *ends)
 
 
+def _parse_size(_context: click.Context, _parameter: click.Parameter, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)\s*[x×,]\s*(\d+)", text.strip())
+    if found is None or not all(1 <= int(side) <= 65_536 for side in found.groups()):
+        raise click.BadParameter(f"{text!r} is not an image size such as 1024x768")
+    return int(found[1]), int(found[2])
+
+
 def _write_ratio(ratio: float) -> str:
     return f"{100.0 * ratio:.12g}%"
 
@@ -411,8 +400,17 @@ def _write_tilts(tilts_rad: Iterable[float]) -> str:
 KINDS: dict[str, Kind] = {
     "": Kind(),
     "path": Kind(type=PATH),
+    "path of a file": Kind("FILE", PATH),
     "length": Kind("LENGTH", LENGTH, write=_write_length),
     "length or 0": Kind("LENGTH", LENGTH_OR_ZERO, write=_write_length),
+    "height": Kind("LENGTH", HEIGHT),
+    "time to listen": Kind(
+        "TIME",
+        Quantity("time", "s", "3s or 500ms", within=(0.1, 3600.0)),
+        write=lambda s: f"{s:g}s",
+    ),
+    "factor": Kind(type=click.FloatRange(min=0.0, min_open=True)),
+    "image size": Kind("WxH", parse=_parse_size),
     "time ahead": Kind("TIME", Quantity("time", "s", "5s or 500ms", within=(0.0, 1e6))),
     "lengths": Kind("LENGTH,...", parse=parse_lengths),
     "ratio": Kind("RATIO", parse=parse_ratio, write=_write_ratio),

@@ -156,11 +156,7 @@ def echo_verdict(calibration: CalibrationModel) -> None:
 
 def echo_term_sizes(calibration: CalibrationModel) -> None:
     """Print how large each kind of distortion is; nothing for a calibration without further terms."""
-    from semcal_ros.core.camera.term_sizes import (
-        describe_term_sizes,
-        has_terms,
-        largest_term_sizes,
-    )
+    from semcal_ros.core.camera.term_sizes import describe_term_sizes, has_terms, largest_term_sizes
 
     cameras = [calibration.at(g) for g in calibration.magnifications]
     if any(has_terms(camera) for camera in cameras):

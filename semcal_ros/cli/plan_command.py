@@ -17,20 +17,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import (
-    PATH,
-    config_option,
-    json_option,
-    parse_magnification,
-    parse_ratio,
-    squares_option,
-)
+from semcal_ros.cli.options import PATH, config_option, json_option, options_of
 from semcal_ros.cli.output import echo_json, echo_table
 from semcal_ros.core.calibration.judgement.plan import ViewPlan, plan_views
 from semcal_ros.core.calibration.judgement.thresholds import (
@@ -39,58 +33,48 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     PLANNED_TILTS_RAD,
 )
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.ladder.plan import PlannedStep, plan_ladder
+from semcal_ros.core.ladder.acquisition import PlannedStep, plan_ladder
 from semcal_ros.core.wording import counted
 from semcal_ros.workflows.inputs import resolve_config
+from semcal_ros.workflows.options import SQUARES, Option
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """What the views are to reach, and what is assumed until they are recorded."""
+
+    target: Annotated[
+        float | None,
+        Option(
+            "1-sigma of nm per pixel to reach at all calibrated magnifications, such as 0.1%.",
+            kind="ratio",
+        ),
+    ] = None
+    visits: Annotated[int, Option("Propose at most so many visits.", between=(1, 30))] = 10
+    ageing: Annotated[
+        float,
+        Option(
+            "1-sigma of a relative change of the scale until the views are recorded, as of `semcal update`.",
+            kind="ratio",
+        ),
+    ] = DEFAULT_AGEING
+    squares: Annotated[tuple[float, ...] | None, SQUARES] = None
+    last: Annotated[
+        float | None,
+        Option(
+            "Instead: pictures of a specimen with which `semcal extend` reaches this magnification, such as 100000x.",
+            kind="magnification",
+            names=("--extend",),
+        ),
+    ] = None
 
 
 @click.command("plan")
 @click.argument("calibration", type=PATH)
-@click.option(
-    "--target",
-    default=None,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="1-sigma of nm per pixel to reach at all calibrated magnifications, such as 0.1%.",
-)
-@click.option(
-    "--visits",
-    type=click.IntRange(1, 30),
-    default=10,
-    show_default=True,
-    help="Propose at most so many visits.",
-)
-@click.option(
-    "--ageing",
-    default=f"{100.0 * DEFAULT_AGEING:g}%",
-    show_default=True,
-    callback=parse_ratio,
-    metavar="RATIO",
-    help="1-sigma of a relative change of the scale until the views are recorded, as of `semcal update`.",
-)
-@squares_option(
-    "Sizes of the squares of the grid, such as 25um,10um, instead of those of the configuration."
-)
-@click.option(
-    "--extend",
-    "last",
-    default=None,
-    callback=parse_magnification,
-    metavar="G",
-    help="Instead: pictures of a specimen with which `semcal extend` reaches this magnification, such as 100000x.",
-)
+@options_of(PlanOptions)
 @config_option
 @json_option
-def command(
-    calibration: Path,
-    target: float | None,
-    visits: int,
-    ageing: float,
-    squares: tuple[float, ...] | None,
-    last: float | None,
-    config: str,
-    as_json: bool,
-) -> None:
+def command(calibration: Path, options: PlanOptions, config: str, as_json: bool) -> None:
     """Which views to record next for CALIBRATION, so that nm per pixel becomes more certain, or reaches farther.
 
     Record them, and use them with `semcal update`; those of --extend with `semcal extend`.
@@ -100,6 +84,7 @@ def command(
       semcal plan cal.yaml --target 0.1%
       semcal plan cal.yaml --extend 100000x
     """
+    target, last = options.target, options.last
     if (target is None) == (last is None):
         raise InvalidValueError(
             "neither --target nor --extend" if target is None else "--target and --extend",
@@ -118,9 +103,9 @@ def command(
     plan = plan_views(
         model,
         target,
-        squares_m=squares or microscope.squares_m,
-        most_visits=visits,
-        ageing=ageing,
+        squares_m=options.squares or microscope.squares_m,
+        most_visits=options.visits,
+        ageing=options.ageing,
     )
     if as_json:
         echo_json(asdict(plan))

@@ -18,50 +18,47 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
 
-from semcal_ros.cli.options import config_option
+from semcal_ros.cli.options import config_option, options_of
 from semcal_ros.core.errors import SemcalError
+from semcal_ros.workflows.options import Option
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """How a recording is replayed."""
+
+    rate: Annotated[float, Option("How many times as fast.", kind="factor")] = 1.0
+    loop: Annotated[bool, Option("Start again at the end.")] = False
+    paused: Annotated[bool, Option("Start paused; a call of ~/pause goes on.")] = False
+    wait: Annotated[
+        int,
+        Option(
+            "Wait until images and magnification have this many subscribers each.", between=(0, 100)
+        ),
+    ] = 0
+    clock: Annotated[bool, Option("Do not publish /clock.", names=("--no-clock",))] = True
+    topics: Annotated[
+        str,
+        Option(
+            "What is played. inputs: images, magnification and stage by the configuration, and conditions; all: also"
+            " what nodes published while it was recorded.",
+            metavar="inputs|all|NAME,...",
+        ),
+    ] = "inputs"
+    exclude: Annotated[str | None, Option("Topics that are not played.", metavar="NAME,...")] = None
 
 
 @click.command("play")
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option(
-    "--rate", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True
-)
-@click.option("--loop", is_flag=True, help="Start again at the end.")
-@click.option("--paused", is_flag=True, help="Start paused; a call of ~/pause goes on.")
-@click.option(
-    "--wait",
-    type=click.IntRange(0, 100),
-    default=0,
-    show_default=True,
-    help="Wait until images and magnification have this many subscribers each.",
-)
-@click.option("--no-clock", is_flag=True, help="Do not publish /clock.")
-@click.option(
-    "--topics",
-    default="inputs",
-    show_default=True,
-    metavar="inputs|all|NAME,...",
-    help="What is played. inputs: images, magnification and stage by the configuration, and conditions; all: also what"
-    " nodes published while it was recorded.",
-)
-@click.option("--exclude", default="", metavar="NAME,...", help="Topics that are not played.")
+@options_of(PlayOptions)
 @config_option
-def command(
-    recording: Path,
-    rate: float,
-    loop: bool,
-    paused: bool,
-    wait: int,
-    no_clock: bool,
-    topics: str,
-    exclude: str,
-    config: str,
-) -> None:
+def command(recording: Path, options: PlayOptions, config: str) -> None:
     """Replay RECORDING as ROS topics, as `ros2 run semcal_ros bag_player` does.
 
     \b
@@ -80,13 +77,13 @@ def command(
         ) from error
     parameters: dict[str, bool | int | float | str] = {
         "bag": str(recording.absolute()),
-        "rate": rate,
-        "loop": loop,
-        "start_paused": paused,
-        "wait_for_subscribers": wait,
-        "clock": not no_clock,
-        "topics": topics,
-        "exclude": exclude,
+        "rate": options.rate,
+        "loop": options.loop,
+        "start_paused": options.paused,
+        "wait_for_subscribers": options.wait,
+        "clock": options.clock,
+        "topics": options.topics,
+        "exclude": options.exclude or "",
         "config": config,
     }
     arguments = ["--ros-args"]

@@ -20,18 +20,20 @@ import os
 import signal
 import sys
 import threading
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
-from semcal_ros.cli.options import calibration_option, no_drift_option
+from semcal_ros.cli.options import options_of
 from semcal_ros.cli.recording_input import optional_recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.inputs import open_source, resolve_calibration, resolve_config
+from semcal_ros.workflows.options import Option
 
 _TOKEN = "SEMCAL_VIEW_TOKEN"
 
@@ -46,29 +48,33 @@ def require_view() -> None:
         )
 
 
+@dataclass(frozen=True)
+class ViewOptions:
+    """What the page shows, and where it is served."""
+
+    calibration: Annotated[
+        Path | None,
+        Option("Calibration file; of a live stream, that on the topic by default.", kind="path"),
+    ] = None
+    drift: Annotated[
+        bool, Option("Do not follow the drift of RECORDING.", names=("--no-drift",))
+    ] = True
+    namespace: Annotated[str, Option("Of the nodes and topics.")] = "/sem"
+    host: Annotated[str, Option("Address to listen on.")] = "localhost"
+    port: Annotated[int, Option("Port to listen on; 0 takes a free one.", between=(0, 65535))] = (
+        8060
+    )
+
+
 @click.command("view")
 @optional_recording_input
-@calibration_option("Calibration file; of a live stream, that on the topic by default.")
-@no_drift_option("Do not follow the drift of RECORDING.")
-@click.option("--namespace", default="/sem", show_default=True, help="Of the nodes and topics.")
-@click.option("--host", default="localhost", show_default=True, help="Address to listen on.")
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8060,
-    show_default=True,
-    help="Port to listen on; 0 takes a free one.",
-)
+@options_of(ViewOptions)
 @click.pass_context
 def command(
     context: click.Context,
     recording: RecordedFiles | None,
     config: MicroscopeConfig,
-    calibration: Path | None,
-    no_drift: bool,
-    namespace: str,
-    host: str,
-    port: int,
+    options: ViewOptions,
 ) -> None:
     """Show the live stream, or RECORDING, in the browser: raw and corrected, with lengths and their uncertainty.
 
@@ -83,8 +89,9 @@ def command(
     """
     require_view()
     token = os.environ.get(_TOKEN, "")
+    calibration, host, port = options.calibration, options.host, options.port
     if recording is not None:
-        _show_recording(recording, config, calibration, not no_drift, host, port, token)
+        _show_recording(recording, config, calibration, options.drift, host, port, token)
         return
     try:
         from semcal_ros.nodes.viewer import run_viewer
@@ -94,10 +101,12 @@ def command(
             expected="rclpy for a live stream, or a RECORDING",
             do="source a ROS 2 workspace or run `make setup`",
         ) from error
-    if no_drift:
+    if not options.drift:
         raise InvalidValueError("--no-drift for a live stream", expected="a RECORDING with it")
-    if not namespace.startswith("/"):
-        raise InvalidValueError(f"--namespace {namespace}", expected="a name that begins with /")
+    if not options.namespace.startswith("/"):
+        raise InvalidValueError(
+            f"--namespace {options.namespace}", expected="a name that begins with /"
+        )
     parameters = {
         # The node reads it by its name.
         "config": context.params["config"],
@@ -106,7 +115,7 @@ def command(
         "port": str(port),
         "token": token,
     }
-    arguments = ["--ros-args", "-r", f"__ns:={namespace}"]
+    arguments = ["--ros-args", "-r", f"__ns:={options.namespace}"]
     for name, value in parameters.items():
         if value:
             arguments += ["-p", f"{name}:={value}"]

@@ -12,15 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``msg_configs`` files: how one microscope's own topics, fields and units map onto the suite.
+"""``msg_configs`` files: how one microscope's own topics, fields and units map onto the suite; and where they lie.
 
 The classes below are the one declaration of such a file: its keys, defaults and limits. pydantic
 checks a file against them, and the ``description`` of a field is what an error names as expected.
 ``msg_configs/generic.yaml`` and ``doc/msg_configs.md`` explain every key; tests compare them.
+
 """
 
 from __future__ import annotations
 
+import os
+import sys
+import warnings
 from collections.abc import Iterator
 from functools import lru_cache, wraps
 from pathlib import Path
@@ -36,11 +40,15 @@ from pydantic import (
     ValidationError,
 )
 from pydantic.dataclasses import dataclass
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer, ComposerError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLWarning
+from ruamel.yaml.events import AliasEvent
 
-from semcal_ros.config.files import find_config_file, load_yaml, read_config_text
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.core.wording import did_you_mean
+from semcal_ros.text_files import CONSTRUCTOR_ERRORS, read_text_file
 
 IMAGE_TYPE: Final = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE_TYPE: Final = "sensor_msgs/msg/CompressedImage"
@@ -55,6 +63,12 @@ StampMoment = Literal["start", "centre", "end"]
 
 _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
 _MAX_SEEN = 80  # characters of a wrong value in an error, which is one line
+
+_SUFFIXES = (".yaml", ".yml")
+_MAX_BYTES = 1024 * 1024  # the commented template has 3 kB; this only keeps other files out
+_MAX_REASON = 80  # a longer one would not fit on a line beside the name of the file
+# A configuration is nested 3 deep. Without a limit 3000 brackets keep the parser busy for seconds.
+_MAX_DEPTH = 16
 
 
 def _read_whole(value: Any) -> Any:
@@ -84,30 +98,56 @@ def _sort_largest_first(sizes: tuple[float, ...]) -> tuple[float, ...]:
 
 # `strict`: no text for a number and no bool for an integer.
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
 _Whole = BeforeValidator(_read_whole)
+
+
 # 255 characters are the longest name that DDS takes.
 _Name = Annotated[str, Field(strict=True, min_length=1, max_length=255)]
+
+
 _Topic = Annotated[
     _Name, Field(pattern=r"^(~/|/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$")
 ]
+
+
 _Type = Annotated[_Name, Field(pattern=r"^[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*$")]
+
+
 _FieldPath = Annotated[
     _Name,
     Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\[[0-9]+\])?(\.[A-Za-z_][A-Za-z0-9_]*(\[[0-9]+\])?)*$"),
 ]
+
+
 _Frame = Annotated[_Name, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_/-]*$")]
+
+
 # Upper limits of lengths and times only catch a wrong unit: nothing real comes near them.
 _DisplayWidth = Annotated[_Number, Field(gt=0.0, le=100.0)]
+
+
 _SquareSize = Annotated[_Number, Field(gt=0.0, le=1.0)]
+
+
 # A stage that is known to no better than half a radian or ten millimetres is not known at all.
 _AngleSigma = Annotated[_Number, Field(gt=0.0, le=0.5)]
+
+
 _LengthSigma = Annotated[_Number, Field(gt=0.0, le=0.01)]
+
 
 # Of a side of a picture.
 _Part = Annotated[_Number, Field(ge=0.0, le=1.0)]
 
+
 _FILE = ConfigDict(extra="forbid")
+
+
 _TOPIC = "a ROS topic name such as image_raw"
+
+
 _JOINT = "the name of a joint such as tilt"
 
 
@@ -396,12 +436,19 @@ _MAPPINGS: dict[str, Any] = {
     "stage": StageConfig,
     "stage.sigma": StageSigmas,
 }
+
+
 # A file has to say these although the classes have defaults: a number of another quantity looks
 # much like a magnification.
 _REQUIRED = {"": "magnification", "magnification": "quantity"}
+
+
 _UNKNOWN = ("unexpected_keyword_argument", "invalid_key")
 
+
 Location = tuple[str | int, ...]
+
+
 #: What is wrong at which key: pydantic's type of error, and the value.
 Problems = dict[Location, tuple[str, Any]]
 
@@ -423,7 +470,7 @@ def load_config(name_or_path: str | Path) -> MicroscopeConfig:
     ----------
     name_or_path
         Path of a YAML file, or the bare name of one that is shipped (``"jsm820"``; see
-        :func:`~semcal_ros.config.files.config_names`).
+        :func:`~semcal_ros.config.config.config_names`).
 
     Raises
     ------
@@ -556,3 +603,122 @@ def _check_magnification(given: dict[str, Any], read: MagnificationConfig, sourc
                 expected=f"this key only with the quantity {quantity}",
                 do="remove the key or correct the quantity",
             )
+
+
+def config_directories() -> tuple[Path, ...]:
+    """Existing folders with configurations, the most specific first.
+
+    The folder beside the package (a source tree), the one inside the package,
+    ``share/semcal_ros/msg_configs`` under each prefix of the ament index, and the same under the
+    Python environment's prefix.
+    """
+    return tuple(dict.fromkeys(place for place in _list_candidates() if place.is_dir()))
+
+
+def _list_candidates() -> Iterator[Path]:
+    package = Path(__file__).resolve().parents[1]
+    yield package.parent / "msg_configs"
+    yield package / "msg_configs"
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    for prefix in [*filter(None, prefixes), sys.prefix]:
+        yield Path(prefix) / "share" / "semcal_ros" / "msg_configs"
+
+
+def config_names() -> tuple[str, ...]:
+    """Bare names of all configurations that are found, sorted."""
+    names = {
+        path.stem
+        for place in config_directories()
+        for path in place.iterdir()
+        if path.suffix in _SUFFIXES and path.is_file()
+    }
+    return tuple(sorted(names))
+
+
+def find_config_file(name_or_path: str | Path) -> Path:
+    """Path of a configuration given by path or by bare name.
+
+    Raises
+    ------
+    ConfigError
+        There is no such configuration.
+    """
+    text = str(name_or_path)
+    path = _find_existing_file(Path(text))
+    if path is None and text == Path(text).name:
+        path = _find_shipped_file(Path(text))
+    if path is not None:
+        return path
+    raise ConfigError(
+        f"no configuration {text[:200]!r}",
+        expected="the path of a YAML file or one of the names " + ", ".join(config_names()),
+        do=did_you_mean(text[:200], config_names())
+        or "check the spelling or copy msg_configs/generic.yaml",
+    )
+
+
+def _find_shipped_file(name: Path) -> Path | None:
+    stem = name.stem if name.suffix in _SUFFIXES else name.name
+    candidates = (
+        _find_existing_file(place / f"{stem}{suffix}")
+        for place in config_directories()
+        for suffix in _SUFFIXES
+    )
+    return next(filter(None, candidates), None)
+
+
+def _find_existing_file(path: Path) -> Path | None:
+    try:
+        expanded = path.expanduser()
+        return expanded if expanded.is_file() else None
+    except (OSError, RuntimeError, ValueError):
+        # A name that is too long, an unreadable folder or an unknown home: no such file for us.
+        return None
+
+
+def read_config_text(path: Path) -> str:
+    """Text of a configuration file; raises :class:`ConfigError` where it cannot be read."""
+    return read_text_file(path, _MAX_BYTES, error=ConfigError, expected="a readable YAML file")
+
+
+class _PlainComposer(Composer):
+    """Refuses aliases, with which a short text stands for exponentially much, and deep nesting."""
+
+    _depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.parser.peek_event()
+        if isinstance(event, AliasEvent):
+            raise ComposerError(None, None, "an alias is used", event.start_mark)
+        if self._depth == _MAX_DEPTH:
+            what = f"nested more than {_MAX_DEPTH} deep"
+            raise ComposerError(None, None, what, event.start_mark)
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+def load_yaml(text: str, source: str) -> Any:
+    """Values of a YAML 1.2 text, in which ``25e-6`` is a number and a key stands once.
+
+    Raises
+    ------
+    ConfigError
+        The text is not valid YAML, repeats a key or has an alias. The message names ``source`` and
+        the line.
+    """
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _PlainComposer
+    try:
+        with warnings.catch_warnings():
+            # A file may say `%YAML 1.1`, and then be warned about 25e-6.
+            warnings.simplefilter("ignore", YAMLWarning)
+            return yaml.load(text)
+    except MarkedYAMLError as error:
+        line = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
+        reason = " ".join((error.problem or "not valid YAML").split())[:_MAX_REASON]
+        seen = f"{source}: {reason}{line}"
+    except (YAMLError, *CONSTRUCTOR_ERRORS) as error:
+        seen = f"{source}: {type(error).__name__} while reading YAML"
+    raise ConfigError(seen, expected="a YAML file", do="compare with msg_configs/generic.yaml")

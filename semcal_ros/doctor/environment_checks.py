@@ -32,10 +32,10 @@ from packaging.version import InvalidVersion
 from semcal_ros.core.errors import ConfigError
 from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.observations import Environment
-from semcal_ros.middleware.ament_prefix import prefixes_of_user
-from semcal_ros.middleware.transport_advice import (
+from semcal_ros.middleware import (
     SharedMemory,
     local_only,
+    prefixes_of_user,
     profile_file,
     shared_memory,
 )

@@ -34,22 +34,16 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.bridge.conditions import read_conditions
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.stage import read_stage, require_radians
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.doctor.graph_checks import CONDITIONS, Topic
-from semcal_ros.doctor.observations import (
-    Arrival,
-    Endpoint,
-    Graph,
-    NodeStatus,
-    Session,
-)
+from semcal_ros.doctor.observations import Arrival, Endpoint, Graph, NodeStatus, Session
 from semcal_ros.doctor.stream_checks import describe_image
-from semcal_ros.middleware.message_types import message_class
+from semcal_ros.middleware import message_class
 
 # Time for discovery, before which nothing is known.
 _DISCOVERY_S = 1.0

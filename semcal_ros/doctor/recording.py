@@ -41,8 +41,7 @@ from semcal_ros.doctor.stream_checks import (
     check_stamps,
     describe_image,
 )
-from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag
-from semcal_ros.files.bags.topics import topic_matches
+from semcal_ros.files.bags.reader import BagReader, RawMessage, open_bag, topic_matches
 
 _RECORDING = "the recording"
 _CALIBRATION = "calibration"

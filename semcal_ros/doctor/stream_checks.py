@@ -34,7 +34,7 @@ from semcal_ros.doctor.findings import CheckResult, note, ok, problem
 from semcal_ros.doctor.graph_checks import Topic
 from semcal_ros.doctor.observations import Arrival, ImageSeen, Session
 from semcal_ros.files.images.databar import DatabarCutter
-from semcal_ros.middleware.transport_advice import transport_advice
+from semcal_ros.middleware import transport_advice
 
 # A stamp that differs by more is from another clock, such as a recording's.
 _OTHER_CLOCK_S = 3600.0

@@ -22,8 +22,7 @@ from typing import Any, Protocol
 
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import ConfigError
-from semcal_ros.drivers.folder import FolderSource
-from semcal_ros.drivers.journal import default_journal
+from semcal_ros.drivers.folder import FolderSource, default_journal
 from semcal_ros.drivers.openfibsem import OpenFibsemSource, require_fibsem
 from semcal_ros.drivers.source import FrameSource
 from semcal_ros.drivers.video import SideFile, VideoSource

@@ -32,13 +32,18 @@ import jsonschema
 import numpy as np
 import yaml
 
-from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
+from semcal_ros.bridge.calibration import MAX_TEXT_BYTES
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, names_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.fit_record import Certificate, FitRecord, ScaleShares
-from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import (
+    Certificate,
+    FitRecord,
+    LadderRecord,
+    Provenance,
+    Relay,
+    ScaleShares,
+)
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import CalibrationFileError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_text

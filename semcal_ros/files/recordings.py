@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.compressed import decoded_image, describe_compressed
-from semcal_ros.bridge.fields import require_fields
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.conditions import Conditions
+from semcal_ros.bridge.fields import require_fields, stamp_ns_from_msg
 from semcal_ros.bridge.images import without_databar
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS
 from semcal_ros.config.config import MagnificationConfig, MicroscopeConfig, load_config
@@ -41,12 +41,16 @@ from semcal_ros.core.calibration.thresholds import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError, UnknownScaleError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.conditions import find_conditions
-from semcal_ros.files.bags.errors import reading
-from semcal_ros.files.bags.held_values import MagnificationTrack
-from semcal_ros.files.bags.reader import BagTopic, RawMessage, is_bag, open_bag
-from semcal_ros.files.bags.stage import find_stage
-from semcal_ros.files.bags.topics import find_image_topic, find_topic
+from semcal_ros.files.bags.held_values import MagnificationTrack, find_conditions, find_stage
+from semcal_ros.files.bags.reader import (
+    BagTopic,
+    RawMessage,
+    find_image_topic,
+    find_topic,
+    is_bag,
+    open_bag,
+    reading,
+)
 from semcal_ros.files.images.databar import DatabarFinder
 from semcal_ros.files.images.image_series import (
     ImageSeries,
@@ -55,7 +59,6 @@ from semcal_ros.files.images.image_series import (
     list_image_series,
 )
 from semcal_ros.files.images.mask import fill_masked, fit_mask, read_mask
-from semcal_ros.files.tiff.sem_image import Conditions
 
 if TYPE_CHECKING:
     from typing_extensions import Self

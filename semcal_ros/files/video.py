@@ -36,6 +36,9 @@ from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.scale_bar import ScaleBar, draw_scale_bar
 
+#: Grey levels of more than 8 bits are shown with these quantiles as black and white: one pixel in a thousand may be
+#: clipped at either end.
+BLACK_WHITE = (0.001, 0.999)
 #: Frames per second that can be asked for: a frame in ten seconds, and the fastest common displays.
 FPS_RANGE = (0.1, 240.0)
 #: Suffixes of files that are opened as videos.

@@ -30,15 +30,14 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
-from semcal_ros.bridge.headers import fill_stamp
+from semcal_ros.bridge.fields import fill_stamp
 from semcal_ros.core.errors import BagError, ConfigError, InvalidValueError, SemcalError
-from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
-from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag
-from semcal_ros.files.bags.topics import topic_matches
-from semcal_ros.middleware.message_types import message_class
+from semcal_ros.files.bags.held_values import CONDITIONS_TOPIC
+from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag, topic_matches
+from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.endpoints import PatientPublisher
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
-from semcal_ros.nodes.common.publisher import PatientPublisher
 from semcal_ros.nodes.common.qos import overridable, service_queue, stream_output, value_input
 from semcal_ros.nodes.common.run import run_node
 

@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -26,50 +28,49 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from semcal_ros.bridge.calibration_text import fill_calibration_text
-from semcal_ros.bridge.calibration_warnings import ScaleWarnings
+from semcal_ros.bridge.calibration import ScaleWarnings, fill_calibration_text
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.calibration.acquisition import (
-    ViewRequest,
-)
+from semcal_ros.core.calibration.acquisition import ViewRequest
 from semcal_ros.core.calibration.judgement.check import Verdict
 from semcal_ros.core.calibration.options import METHODS, RESIDUAL_MODES, CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.errors import (
-    CalibrationError,
-    InvalidValueError,
-    Rejection,
-)
+from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.wording import counted
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.driver import AcquisitionDriver
 from semcal_ros.nodes.acquisition.ladder import LadderRun, place_of
-from semcal_ros.nodes.acquisition.run import (
-    ACQUISITION,
-    Progress,
-)
+from semcal_ros.nodes.acquisition.run import ACQUISITION, Progress
 from semcal_ros.nodes.calibration_state import (
     CalibrationState,
     CurrentState,
     RunningJob,
     StreamPicture,
 )
-from semcal_ros.nodes.common.output_file import OUTPUT, OutputFile
-from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration
+from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration, Parameters
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 from semcal_ros.nodes.frames.calibration_input import calibration_digest, report_scale_warnings
-from semcal_ros.nodes.frames.conditions import ConditionsInput
+from semcal_ros.nodes.frames.held_values import ConditionsInput
 from semcal_ros.nodes.frames.overlay import corner_overlay
 from semcal_ros.nodes.frames.stage import StageInput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, CalibrationProcess, Stage
 from semcal_ros.workflows.check_and_update import check_found, update_found
+
+_SUFFIXES = (".yaml", ".yml")
+
+OUTPUT = ParameterDeclaration(
+    "output",
+    "calibration.yaml",
+    "File that ~/save writes, from the folder `directory` on. The default never replaces a file that was there before:"
+    " it becomes calibration_2.yaml and so on.",
+    confined=True,
+)
 
 _PARAMETERS = (
     ParameterDeclaration("method", "joint", "Calibration method.", choices=tuple(METHODS)),
@@ -90,6 +91,65 @@ _PARAMETERS = (
     *ACQUISITION,
 )
 _GOAL = ("lowest_magnification", "highest_magnification", "target")
+
+
+class OutputFile:
+    """The file of the parameter :data:`OUTPUT`.
+
+    Parameters
+    ----------
+    parameters
+        Parameters among which is :data:`OUTPUT`.
+    on_change
+        Called with :attr:`plan` when another file is named.
+    """
+
+    def __init__(self, parameters: Parameters, on_change: Callable[[str], None]) -> None:
+        self._parameters = parameters
+        self._written: Path | None = None
+        parameters.on_change(OUTPUT.name, lambda _value: on_change(self.plan), _check_suffix)
+
+    def path(self) -> Path:
+        """Return the file that would be written now; raises :class:`InvalidValueError` if none may be."""
+        name = str(self._parameters[OUTPUT.name] or OUTPUT.default)
+        wanted = self._parameters.allowed_path(name)
+        if name != OUTPUT.default:
+            return wanted
+        number, free = 2, wanted
+        while free.exists() and free != self._written:
+            free = wanted.with_name(f"{wanted.stem}_{number}{wanted.suffix}")
+            number += 1
+        return free
+
+    @property
+    def plan(self) -> str:
+        """What a call to save would do now, in words."""
+        try:
+            path = self.path()
+        except InvalidValueError as error:
+            return f"~/save cannot write: {error}"
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            return f"~/save cannot write {path}: the folder is missing or read-only; set the parameter output"
+        return f"~/save will {self._verb(path)} {path}"
+
+    def _verb(self, path: Path) -> str:
+        return "replace" if path.exists() and path != self._written else "write"
+
+    def write(self, save: Callable[[Path], object]) -> str:
+        """Write the file by ``save(path)``; return what was done, in words, with the whole path."""
+        path = self.path()
+        replaced = self._verb(path) == "replace"
+        save(path)
+        self._written = path
+        return f"saved to {path}" + ", in place of a file that this node had not written" * replaced
+
+
+def _check_suffix(name: str) -> None:
+    # Whoever may call services may name files: a calibration must not become a start-up script.
+    if name and Path(name).suffix not in _SUFFIXES:
+        raise InvalidValueError(
+            f"parameter output = {name!r}", expected="a name that ends in .yaml"
+        )
 
 
 class CalibrationServer(StreamNode):

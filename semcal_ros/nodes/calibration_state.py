@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
@@ -43,13 +44,12 @@ from semcal_ros.core.calibration.judgement.findings import measure_view_coverage
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.recorded import RecordedView
 from semcal_ros.nodes.workers.calibration_worker import (
     CalibrationJob,
@@ -58,9 +58,8 @@ from semcal_ros.nodes.workers.calibration_worker import (
     without_images,
 )
 from semcal_ros.workflows.calibrate import options_for
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.extend import make_picture
-from semcal_ros.workflows.provenance import describe_views
+from semcal_ros.workflows.provenance import ConditionsComparison, describe_views
 
 if TYPE_CHECKING:  # what they move the microscope with needs ROS
     from semcal_ros.nodes.acquisition.ladder import LadderRun

@@ -27,14 +27,19 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Float64MultiArray, Header, String
 
-from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.continuous_parameters import is_continuous_parameter, read_parameter
 from semcal_ros.bridge.magnification import MagnificationReading
-from semcal_ros.bridge.projection import fill_projection, fill_projection_covariance
-from semcal_ros.bridge.static_frames import StaticFrame, fill_static_frames, static_frames
+from semcal_ros.bridge.projection import (
+    StaticFrame,
+    fill_camera_info,
+    fill_projection,
+    fill_projection_covariance,
+    fill_static_frames,
+    static_frames,
+)
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import ConfigError, InvalidValueError, SemcalError
-from semcal_ros.middleware.message_types import message_class
+from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.parameters import (
@@ -43,10 +48,8 @@ from semcal_ros.nodes.common.parameters import (
     ParameterDeclaration,
 )
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.frames.calibration_input import CalibrationInput
-from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
-from semcal_ros.nodes.frames.conditions import ConditionsWatch
-from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.calibration_input import OUT_OF_RANGE, CalibrationInput, RangeWatch
+from semcal_ros.nodes.frames.held_values import ConditionsWatch, MagnificationInput
 
 if TYPE_CHECKING:
     from semcal_ros.nodes.frames.calibration_monitor import CalibrationMonitor

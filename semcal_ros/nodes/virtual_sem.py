@@ -29,7 +29,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, Header
 
 from semcal_ros.bridge.conditions import fill_conditions
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.bridge.magnification import check_magnification
 from semcal_ros.config.config import IMAGE_TYPE

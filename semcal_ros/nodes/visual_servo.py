@@ -19,21 +19,28 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from semcal_ros.applications.servoing import (
     NestedTarget,
     PlaneCamera,
+    PlanePose,
     Servo,
+    ServoSettings,
     ServoStatus,
     ServoStep,
     TargetView,
@@ -41,16 +48,140 @@ from semcal_ros.applications.servoing import (
     find_target,
 )
 from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
-from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.fields import copy_header, stamp_ns_from_msg
+from semcal_ros.bridge.images import image_from_message, to_gray
 from semcal_ros.bridge.magnification import MagnificationReading
+from semcal_ros.bridge.projection import (
+    projection_from_message,
+    stamped_projection_covariance_from_message,
+    stamped_projection_from_message,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.nodes.common.base import SemNode
+from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.parameters import ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.qos import image_input, stream_output, value_input
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
-from semcal_ros.nodes.frames.magnification import MagnificationInput
-from semcal_ros.nodes.servo.input import ServoFrame, ServoInput
-from semcal_ros.nodes.servo.parameters import SERVO_PARAMETERS, read_goal, read_servo_settings
+from semcal_ros.nodes.common.subscription import MessageInfo
+from semcal_ros.nodes.frames.held_values import MagnificationInput
+
+# Frames that wait for their other parts: more than the queues of all inputs hold. Projections: as many magnifications
+# as can be on their way with those frames.
+_WAITING, _PROJECTIONS = 16, 16
+# Frames are complete without these, which bags of earlier versions do not have.
+_OPTIONAL = ("projection_stamped", "projection_covariance_stamped")
+
+_GOAL = (
+    ParameterDeclaration(
+        "goal_x_m", 0.0, "Goal of the target in the sem frame, x.", "m", -1e-3, 1e-3
+    ),
+    ParameterDeclaration(
+        "goal_y_m", 0.0, "Goal of the target in the sem frame, y.", "m", -1e-3, 1e-3
+    ),
+    ParameterDeclaration(
+        "goal_rotation_deg", 0.0, "Goal of its rotation.", "degrees", -180.0, 180.0
+    ),
+)
+_LAW = (
+    ParameterDeclaration(
+        "gain", 1.0, "Fraction of the error that is corrected per second.", "1/s", 0.001, 100.0
+    ),
+    ParameterDeclaration(
+        "speed_limit_um_s", 50.0, "Largest speed of the stage.", "um/s", 1e-3, 1e4
+    ),
+    ParameterDeclaration(
+        "turn_limit_deg_s", 5.0, "Largest speed of the stage's rotation.", "degrees/s", 1e-3, 360.0
+    ),
+    ParameterDeclaration(
+        "travel_limit_px",
+        12.0,
+        "Largest movement of a marker between two frames, which blurs it.",
+        "px",
+        0.1,
+        1e4,
+    ),
+    ParameterDeclaration(
+        "tolerance_px", 0.5, "Largest error at which the goal counts as reached.", "px", 0.01, 100.0
+    ),
+    ParameterDeclaration(
+        "scale_tolerance",
+        0.05,
+        "Largest relative error of the target's size against the camera of the frame.",
+        low=0.001,
+        high=0.5,
+    ),
+    ParameterDeclaration(
+        "axis_sigma_px",
+        15.0,
+        "1-sigma of the calibrated position of the optical axis, which is corrected by what changes of the"
+        " magnification show. 0: it is not corrected.",
+        "px",
+        0.0,
+        1e4,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "feed_forward", True, "Compensate the drift that remains besides the commands."
+    ),
+)
+_STAGE = (
+    ParameterDeclaration("start", False, "Start at once, without ~/start.", fixed=True),
+    ParameterDeclaration(
+        "stage", "virtual_sem/stage", "Topic of the stage's velocity.", fixed=True
+    ),
+    ParameterDeclaration(
+        "goal_frame",
+        "instrument",
+        "instrument: the goal is a place under the beam; what was removed from the image as drift is added again."
+        " specimen: the goal is a place in the drift-free image, for an actuator that moves the target over it.",
+        choices=("instrument", "specimen"),
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "with_drift",
+        True,
+        "Whether a drift is published with each image, as from stream_corrector; false for images of rectifier.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "reset_service",
+        "stream_corrector/reset",
+        "Service to call when the corrected image has moved too far from what is in view; empty: none.",
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "reset_beyond",
+        0.15,
+        "It is called when the drift exceeds this fraction of the width.",
+        low=0.01,
+        high=1.0,
+    ),
+    ParameterDeclaration(
+        "target_cell_m", 180e-6, "Side of a cell of the largest board.", "m", 1e-9, 1.0, fixed=True
+    ),
+    ParameterDeclaration("height_m", 0.0, "Height of the target along the beam.", "m", -1e-3, 1e-3),
+    ParameterDeclaration(
+        "rotation_centre_x_m",
+        0.0,
+        "Where the axis of the stage's rotation meets the target, in the target's frame.",
+        "m",
+        -1.0,
+        1.0,
+        fixed=True,
+    ),
+    ParameterDeclaration(
+        "rotation_centre_y_m",
+        0.0,
+        "Where the axis of the stage's rotation meets the target, in the target's frame.",
+        "m",
+        -1.0,
+        1.0,
+        fixed=True,
+    ),
+)
+SERVO_PARAMETERS = (*_GOAL, *_LAW, *_STAGE)
 
 # Period of the watchdog: a fifth of the shortest silence that it has to notice.
 _TICK_S = 0.1
@@ -70,6 +201,202 @@ _RESET_AGAIN_S = 2.0
 # Longest wait for the acknowledgement of the final zero velocity: a stage that is gone must not
 # hold up the end of the node. Chosen, not measured.
 _LAST_WORD_S = 1.0
+
+
+@dataclass(frozen=True)
+class ServoFrame:
+    """One rectified frame.
+
+    Attributes
+    ----------
+    image
+        (h, w) grey levels.
+    k
+        (3, 3) K of its camera_info; zero without a camera.
+    drift_m
+        (2,) drift that was removed from the image, m.
+    projections
+        (3, 4) P_g with the frame's own stamp; without one, the latest of all, the oldest first.
+    covariance
+        (12, 12) covariance of the P_g with the frame's own stamp, or None where it is not known.
+    header, stamp_ns
+        Its header.
+    """
+
+    image: NDArray[Any]
+    k: Array
+    drift_m: Array
+    projections: tuple[Array, ...]
+    header: Any
+    stamp_ns: int
+    covariance: Array | None = None
+
+
+class ServoInput:
+    """Subscribes to ``image_rect``, ``camera_info``, ``drift``, ``projection_stamped``, its covariance, ``projection``.
+
+    All but the last are paired by stamp. The newest complete frame counts; older ones are dropped. A frame is complete
+    without its ``projection_stamped`` and without the covariance of that.
+
+    Parameters
+    ----------
+    context
+        Of the node.
+    on_frame
+        Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted and passed to ``on_error``.
+    on_error
+        Called with the reason why a frame cannot be used.
+    with_drift
+        Whether a frame needs a drift; otherwise no drift was removed from the image.
+    """
+
+    def __init__(
+        self,
+        context: NodeContext,
+        on_frame: Callable[[ServoFrame], None],
+        on_error: Callable[[str], None],
+        *,
+        with_drift: bool,
+    ) -> None:
+        endpoints = context.endpoints
+        self._reporter = context.reporter
+        self._on_frame = on_frame
+        self._on_error = on_error
+        self._parts: dict[str, dict[int, Any]] = {"image": {}, "info": {}}
+        self._projections: deque[Array] = deque(maxlen=_PROJECTIONS)
+        self._stamped: dict[int, Array] = {}
+        self._covariances: dict[int, Array] = {}
+        self._draining = False
+        endpoints.subscribe(Float64MultiArray, "projection", self._on_projection, value_input())
+        self._inputs = [
+            endpoints.subscribe(
+                Image, "projection_stamped", self._on_stamped_projection, stream_output()
+            ),
+            endpoints.subscribe(
+                Image, "projection_covariance_stamped", self._on_covariance, stream_output()
+            ),
+            endpoints.subscribe(CameraInfo, "camera_info", self._keeps("info"), stream_output()),
+            endpoints.subscribe(Image, "image_rect", self._keeps("image"), image_input()),
+        ]
+        if with_drift:
+            self._parts["drift"] = {}
+            drift = self._keeps("drift")
+            kind = PoseWithCovarianceStamped
+            self._inputs.append(endpoints.subscribe(kind, "drift", drift, stream_output()))
+
+    @property
+    def required_topics(self) -> tuple[str, ...]:
+        """The topics without which no frame is complete."""
+        return tuple(s.topic for s in self._inputs if s.topic not in _OPTIONAL)
+
+    def _on_projection(self, message: Any, _info: MessageInfo) -> None:
+        try:
+            self._projections.append(projection_from_message(message))
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+
+    def _on_stamped_projection(self, message: Any, _info: MessageInfo) -> None:
+        try:
+            matrix = stamped_projection_from_message(message)
+            _insert_newest(self._stamped, stamp_ns_from_msg(message), matrix)
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+
+    def _on_covariance(self, message: Any, _info: MessageInfo) -> None:
+        try:
+            matrix = stamped_projection_covariance_from_message(message)
+            _insert_newest(self._covariances, stamp_ns_from_msg(message), matrix)
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+
+    def _keeps(self, part: str) -> Callable[[Any, MessageInfo], None]:
+        def keep(message: Any, _info: MessageInfo) -> None:
+            if part == "image":
+                self._reporter.count_received()
+            try:
+                _insert_newest(self._parts[part], stamp_ns_from_msg(message), message)
+            except NODE_ERRORS as error:
+                self._reporter.reject(error)
+                self._on_error(" ".join(str(error).split()))
+            if not self._draining:
+                self._drain()
+
+        return keep
+
+    def _drain(self) -> None:
+        """Take all waiting messages, then process the newest frame that has all its parts."""
+        self._draining = True
+        try:
+            for subscription in self._inputs:
+                subscription.take_waiting()
+        finally:
+            self._draining = False
+        complete = set.intersection(*(set(part) for part in self._parts.values()))
+        if not complete:
+            return
+        newest = [stamp for stamp in self._parts["image"] if stamp in complete][-1]
+        parts = {name: waiting[newest] for name, waiting in self._parts.items()}
+        self._reporter.statistics.drop(list(self._parts["image"]).index(newest))
+        for waiting in self._parts.values():
+            for stamp in list(waiting)[: list(waiting).index(newest) + 1]:
+                del waiting[stamp]
+        self._work(newest, parts)
+
+    def _work(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        started_s = time.monotonic()
+        try:
+            image = parts["image"]
+            grey = to_gray(image_from_message(image), image.encoding)
+            drift_m = np.zeros(2)
+            if "drift" in parts:
+                place = parts["drift"].pose.pose.position
+                drift_m = np.array([place.x, place.y])
+            k = np.array(parts["info"].k, dtype=np.float64).reshape(3, 3)
+            stamped = self._stamped.get(stamp_ns)
+            projections = tuple(self._projections) if stamped is None else (stamped,)
+            self._on_frame(
+                ServoFrame(
+                    grey,
+                    k,
+                    drift_m,
+                    projections,
+                    image.header,
+                    stamp_ns,
+                    None if stamped is None else self._covariances.get(stamp_ns),
+                )
+            )
+        except NODE_ERRORS as error:
+            self._reporter.reject(error)
+            self._on_error(" ".join(str(error).split()))
+        self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))
+
+
+def _insert_newest(waiting: dict[int, Any], stamp_ns: int, value: Any) -> None:
+    """Add what belongs to a stamp, and drop what has waited the longest."""
+    waiting[stamp_ns] = value
+    # In order of arrival: stamps go back when a clock does.
+    while len(waiting) > _WAITING:
+        del waiting[next(iter(waiting))]
+
+
+def read_goal(settings: Parameters) -> PlanePose:
+    """Read the goal from the parameters."""
+    angle_rad = math.radians(settings["goal_rotation_deg"])
+    return PlanePose(settings["goal_x_m"], settings["goal_y_m"], angle_rad)
+
+
+def read_servo_settings(settings: Parameters) -> ServoSettings:
+    """Read the settings of the control law from the parameters."""
+    return ServoSettings(
+        gain_hz=settings["gain"],
+        speed_limit_m_s=1e-6 * settings["speed_limit_um_s"],
+        turn_limit_rad_s=math.radians(settings["turn_limit_deg_s"]),
+        travel_limit_px=settings["travel_limit_px"],
+        tolerance_px=settings["tolerance_px"],
+        scale_tolerance=settings["scale_tolerance"],
+        axis_sigma_px=settings["axis_sigma_px"],
+        feed_forward=settings["feed_forward"],
+    )
 
 
 class StageOutput:

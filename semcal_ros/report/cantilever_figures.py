@@ -29,17 +29,12 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from semcal_ros.applications.cantilever import (
-    Deflection,
-    Repeatability,
-    Series,
-    group_frames,
-)
+from semcal_ros.applications.cantilever import Deflection, Repeatability, Series, group_frames
 from semcal_ros.core.errors import BagError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.images.scale_bar import choose_scale_bar, format_length
 from semcal_ros.files.images.write import PixelScale
-from semcal_ros.files.video import open_video, shade
+from semcal_ros.files.video import BLACK_WHITE, open_video, shade
 from semcal_ros.report.html.encode import encode_png
 from semcal_ros.report.html.style import (
     ACCENT,
@@ -61,9 +56,6 @@ _MARKS = "osD^vX"
 _SHOWN_POSES = 3
 # Width of the shown frames: averaging pixels reduces noise and the size of the file.
 _SHOWN_PX = 128
-# Quantiles of the grey levels that a video shows as black and white: one pixel in a thousand may be
-# clipped at either end.
-_BLACK_WHITE = (0.001, 0.999)
 # OpenCV draws at sixteenths of a pixel.
 _FRACTION_BITS = 4
 
@@ -121,7 +113,7 @@ def write_bending_video(
         raise BagError(f"{file} of frames of sizes {sorted(shapes)}", expected="one size")
     height, width = next(iter(shapes))
     some = np.concatenate([pictures[0][::4, ::4].ravel() for pictures in images])
-    low, high = (float(v) for v in np.quantile(some, _BLACK_WHITE))
+    low, high = (float(v) for v in np.quantile(some, BLACK_WHITE))
     count = sum(len(pictures) for pictures in images)
     with open_video(file, (width, height), count, fps) as film:
         assert film is not None

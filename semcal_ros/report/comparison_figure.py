@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 
 from semcal_ros.core.calibration.judgement.compare import CalibrationDifference, DifferenceAt
 from semcal_ros.files.atomic import atomic_write_bytes
+from semcal_ros.report.html.page import format_length
 from semcal_ros.report.html.style import (
     ACCENT,
     INK,
@@ -37,7 +38,6 @@ from semcal_ros.report.html.style import (
     style_axes,
     style_field_axes,
 )
-from semcal_ros.report.html.text import format_length
 
 _DPI = 150.0
 # Letters of a line of the title: a line of them is nine of the ten inches of the figure wide.

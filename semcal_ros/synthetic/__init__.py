@@ -24,6 +24,7 @@ from semcal_ros.synthetic.detector import NOISE_FREE, Detector
 from semcal_ros.synthetic.drift import DRIFTS, NO_DRIFT, Drift, drift_preset
 from semcal_ros.synthetic.live import LiveFrame, LiveScene, VirtualStage
 from semcal_ros.synthetic.microscope import (
+    PRESETS,
     Constant,
     Exponential,
     Logistic,
@@ -31,21 +32,24 @@ from semcal_ros.synthetic.microscope import (
     Saturation,
     VirtualMicroscope,
     conditions_of,
+    preset,
 )
 from semcal_ros.synthetic.plans import (
     CALIBRATION_MAGNIFICATIONS,
     SPECIMEN_KINDS,
+    TRUTH_SCHEMA,
     PlannedFrame,
     RecordingPlan,
     calibration_plan,
     drift_plan,
     ladder_plan,
+    parameters_of,
     specimen_for,
     steps_plan,
+    truth_of,
     zoom_plan,
 )
 from semcal_ros.synthetic.pose import Pose, random_poses
-from semcal_ros.synthetic.presets import PRESETS, preset
 from semcal_ros.synthetic.render import render_frame, render_reflectivity
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
 from semcal_ros.synthetic.specimens.grid import (
@@ -56,7 +60,6 @@ from semcal_ros.synthetic.specimens.grid import (
     Specimen,
     square_for,
 )
-from semcal_ros.synthetic.specimens.thresholds import SQUARES_M
 from semcal_ros.synthetic.stage import (
     STAGES,
     SimulatedStage,
@@ -66,8 +69,11 @@ from semcal_ros.synthetic.stage import (
     pose_on_stage,
     read_position,
 )
-from semcal_ros.synthetic.thresholds import SIMULATED_VOLTAGE_V, SIMULATED_WORKING_DISTANCE_M
-from semcal_ros.synthetic.truth import TRUTH_SCHEMA, parameters_of, truth_of
+from semcal_ros.synthetic.thresholds import (
+    SIMULATED_VOLTAGE_V,
+    SIMULATED_WORKING_DISTANCE_M,
+    SQUARES_M,
+)
 
 __all__ = [
     "CALIBRATION_MAGNIFICATIONS",

@@ -12,17 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The virtual microscope: a camera for every magnification, with its scan timing and its operating conditions.
+"""Virtual microscopes: a camera for every magnification, with its scan timing and conditions; some have names.
 
 Its parameters change with the magnification by laws. None of them is a polynomial in g or in log g: a calibration that
 fits such polynomials meets a curve that it can only approximate, as with a real microscope, so that a test against it
 is meaningful.
+
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -32,6 +35,7 @@ from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.scan_camera import ScanCamera, as_points
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.wording import did_you_mean
 from semcal_ros.synthetic.thresholds import (
     FIXED_POINT_STEPS,
     FIXED_POINT_TOLERANCE_PX,
@@ -341,3 +345,87 @@ class Logistic:
         """Value at a magnification."""
         fraction = 0.5 * (1.0 + math.tanh(0.5 * (magnification - self.middle) / self.width))
         return float(self.low + (self.high - self.low) * fraction)
+
+
+def _jsm820() -> VirtualMicroscope:
+    # Only the distortion centre has the values of the tables of Malti et al. (2012),
+    # doi:10.1117/1.JEI.21.3.033020 (section 4.1.1). The others have the shapes that its text
+    # states, and values of a plausible microscope: doc/paper.md lists both.
+    return VirtualMicroscope(
+        name="jsm820",
+        display_width_m=0.12,
+        scale_error=Saturation(0.018, 0.011, 2600.0),
+        aspect=Exponential(1.002, 1.012, 9000.0),
+        skew=Saturation(0.0005, 0.0032, 6500.0, 1.4),
+        px=Constant(249.3),
+        py=Constant(262.8),
+        rho=Constant(1.0 / 0.020),
+        xi_r=Exponential(0.0071, 0.0007, 3600.0),
+        xi_t=Saturation(0.0004, 0.0016, 4200.0, 1.2),
+        ex=Exponential(230.1, 224.6, 4300.0),
+        ey=Exponential(270.1, 264.6, 4900.0),
+    )
+
+
+def _build() -> dict[str, VirtualMicroscope]:
+    base = _jsm820()
+    zero = Constant(0.0)
+    middle = Constant(255.5)
+    table = {
+        "jsm820": base,
+        "no_distortion": replace(base, xi_r=zero, xi_t=zero),
+        "strong_perspective": replace(base, rho=Constant(1.0 / 0.008), px=Constant(262.0)),
+        "parallel": replace(base, rho=zero, px=middle, py=middle),
+        "off_centre": replace(
+            base,
+            px=Constant(205.0),
+            py=Constant(301.0),
+            ex=Exponential(322.0, 309.0, 3000.0),
+            ey=Saturation(188.0, 203.0, 2500.0),
+        ),
+        "pincushion": replace(
+            base,
+            display_width_m=0.2,
+            xi_r=Logistic(-0.012, -0.002, 2500.0, 1400.0),
+            xi_t=Exponential(-0.0011, 0.0003, 2800.0),
+            scale_error=Logistic(-0.03, 0.01, 3000.0, 2500.0),
+        ),
+        "spiral": replace(base, residual=Residual(spiral=0.004)),
+        "scan_nonlinear": replace(
+            base,
+            residual=Residual(sine=0.003, sine_cycles=1.7, settling=0.006, settling_length=0.08),
+        ),
+        "ideal": replace(
+            base,
+            scale_error=zero,
+            aspect=Constant(1.0),
+            skew=zero,
+            px=middle,
+            py=middle,
+            xi_r=zero,
+            xi_t=zero,
+            ex=middle,
+            ey=middle,
+        ),
+    }
+    return {name: replace(microscope, name=name) for name, microscope in table.items()}
+
+
+PRESETS: Mapping[str, VirtualMicroscope] = MappingProxyType(_build())
+
+
+def preset(name: str) -> VirtualMicroscope:
+    """Return the microscope with this name.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no such preset.
+    """
+    if name not in PRESETS:
+        raise InvalidValueError(
+            f"microscope preset '{name}'",
+            expected=f"one of {', '.join(PRESETS)}",
+            do=did_you_mean(name, PRESETS),
+        )
+    return PRESETS[name]

@@ -12,7 +12,39 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Plans of recordings: which frames, when, at which magnification and pose."""
+"""Plans of recordings: which frames, when, at which magnification and pose; and their truth as plain values for a file.
+
+Keys of the truth carry their unit; everything is SI or px. The dictionary holds::
+
+    schema              "semcal_ros/truth/1"
+    microscope          name of the preset
+    specimen            "grid", "gold" or "flat"
+    image_width_px, image_height_px, norm_px, display_width_m, databar_rows
+    scan                frame_time_s, averages, flyback_fraction
+    frames              list, in the order of the recording:
+        start_time_s        start of the first pass, after the start of the recording
+        magnification
+        rotation            (3, 3): X = rotation x + translation_m + drift
+        translation_m       (3,)
+        square_m            square size, or None without a grid
+        drift_m             (2,) at the centre of the acquisition; what lay at X is seen
+                            at X + drift
+        pixel_size_m        (x, y) true size of an undistorted pixel at the reference plane, in
+                            this visit
+        visit, visit_scale  number of the visit of the magnification, and the factor with which it
+                            came back
+        stage, stage_read   tilt, rotation, x, y, z, scan_rotation (rad, m): where the stage was,
+                            and what it said; None for a stage that says nothing
+    stage               tilt_axis_rad (None for any direction), miss_m (beside the beam, below),
+                        height_sigma_m, repeatability, tilt_error_rad, rotation_error_rad,
+                        line_jitter_px; None for a perfect one
+    grid                stretch, shear, curvature_per_m, wave, wave_squares, and square_errors, a
+                        list of square_m and relative error; None for a perfect one
+    parameters          list, one entry per magnification, ascending, without the visits' factors:
+        magnification, m_px_per_m, aspect, skew, principal_point_px (x, y), rho_per_m, xi_r, xi_t,
+        centre_px (x, y), residual_spiral, residual_sine, residual_settling
+    residual_sine_cycles, residual_settling_length   shape of the residual, see Residual
+"""
 
 from __future__ import annotations
 
@@ -20,6 +52,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +87,8 @@ SPECIMEN_KINDS: tuple[str, ...] = ("grid", "gold", "flat", "target", "rough_targ
 
 CALIBRATION_MAGNIFICATIONS: tuple[float, ...] = (100.0, *(500.0 * k for k in range(1, 21)))
 """100 and 500, 1000, ... 10 000, as in Malti et al. (2012)."""
+
+TRUTH_SCHEMA = "semcal_ros/truth/1"
 
 
 def specimen_for(
@@ -428,3 +463,100 @@ def _at_rest(
 def _require_positive(what: str, count: int) -> None:
     if count < 1:
         raise InvalidValueError(f"{count} {what}", expected="at least 1")
+
+
+def parameters_of(microscope: VirtualMicroscope, magnification: float) -> dict[str, Any]:
+    """Return the true camera parameters at a magnification, as listed above."""
+    camera = microscope.camera_at(magnification)
+    residual, growth = microscope.residual, microscope.residual_growth(magnification)
+    return {
+        "magnification": camera.magnification,
+        "m_px_per_m": camera.m,
+        "aspect": camera.aspect,
+        "skew": camera.skew,
+        "principal_point_px": [camera.px, camera.py],
+        "rho_per_m": camera.rho,
+        "xi_r": camera.xi_r,
+        "xi_t": camera.xi_t,
+        "centre_px": [camera.ex, camera.ey],
+        "residual_spiral": growth * residual.spiral,
+        "residual_sine": growth * residual.sine,
+        "residual_settling": growth * residual.settling,
+    }
+
+
+def truth_of(plan: RecordingPlan) -> dict[str, Any]:
+    """Return the truth of a recording as lists, numbers and strings, ready for JSON."""
+    microscope = plan.microscope
+    magnifications = sorted({frame.magnification for frame in plan.frames})
+    return {
+        "schema": TRUTH_SCHEMA,
+        "microscope": microscope.name,
+        "specimen": plan.kind,
+        "image_width_px": microscope.width,
+        "image_height_px": microscope.height,
+        "norm_px": 0.5 * microscope.width,
+        "display_width_m": microscope.display_width_m,
+        "databar_rows": plan.detector.databar_rows,
+        "scan": {
+            "frame_time_s": microscope.timing.frame_time_s,
+            "averages": microscope.timing.averages,
+            "flyback_fraction": microscope.timing.flyback_fraction,
+        },
+        "frames": [_describe_frame(plan, index) for index in range(len(plan))],
+        "parameters": [parameters_of(microscope, g) for g in magnifications],
+        "residual_sine_cycles": microscope.residual.sine_cycles,
+        "residual_settling_length": microscope.residual.settling_length,
+        "stage": _describe_stage(plan),
+        "grid": _describe_grid(plan),
+    }
+
+
+def _describe_stage(plan: RecordingPlan) -> dict[str, Any] | None:
+    stage = plan.stage
+    if stage is None:
+        return None
+    return {
+        "tilt_axis_rad": stage.axis_rad,
+        "miss_m": list(stage.miss_m),
+        "height_sigma_m": stage.height_sigma_m,
+        "repeatability": stage.scale_sigma,
+        "tilt_error_rad": stage.tilt_error_rad,
+        "rotation_error_rad": stage.rotation_error_rad,
+        "line_jitter_px": plan.detector.line_jitter_px,
+    }
+
+
+def _describe_grid(plan: RecordingPlan) -> dict[str, Any] | None:
+    grid = plan.grid
+    if grid is None:
+        return None
+    return {
+        "stretch": grid.stretch,
+        "shear": grid.shear,
+        "curvature_per_m": grid.curvature,
+        "wave": grid.wave,
+        "wave_squares": grid.wave_squares,
+        "square_errors": [
+            {"square_m": square_m, "error": error}
+            for square_m, error in grid.size_errors(plan.seed).items()
+        ],
+    }
+
+
+def _describe_frame(plan: RecordingPlan, index: int) -> dict[str, Any]:
+    frame = plan.frames[index]
+    camera = plan.microscope.during_visit(frame.visit_scale).camera_at(frame.magnification)
+    return {
+        "start_time_s": frame.start_time_s,
+        "magnification": frame.magnification,
+        "rotation": frame.pose.R.tolist(),
+        "translation_m": frame.pose.t_m.tolist(),
+        "square_m": frame.square_m,
+        "drift_m": plan.drift_at_centre_m(index).tolist(),
+        "pixel_size_m": list(camera.pixel_size_m),
+        "visit": frame.visit,
+        "visit_scale": frame.visit_scale,
+        "stage": None if frame.position is None else frame.position.joints,
+        "stage_read": frame.joints,
+    }

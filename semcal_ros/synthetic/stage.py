@@ -16,7 +16,8 @@
 
 It shares neither priors nor equations with the calibration: the specimen is a rigid body that is
 turned about axes in space, and its points are projected by the true camera. So it serves to test the
-stated uncertainty.
+stated uncertainty. A stage that is driven does not do quite what it is told: wrong gain, tilted axes, and backlash.
+
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -32,6 +34,7 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import GridView
+from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
@@ -136,6 +139,8 @@ STAGES: Mapping[str, SimulatedStage] = MappingProxyType(
         ),
     }
 )
+
+
 """``one-axis`` is like the stage of a scanning electron microscope; ``two-axis``, which tilts in every direction
 about the specimen itself, is like none."""
 
@@ -420,3 +425,146 @@ def _seen(camera: ScanCamera, points: Array, scale: float) -> tuple[Array, Array
     with np.errstate(invalid="ignore"):
         seen = np.all((xy > 5) & (xy < np.array([camera.width, camera.height]) - 6), axis=1)
     return xy[seen], seen
+
+
+@dataclass(frozen=True)
+class ActuatorFaults:
+    """How far the axes of a stage are from what a controller assumes.
+
+    Attributes
+    ----------
+    gain
+        (x, y) travel over commanded travel.
+    turned_rad
+        Angle from the commanded to the actual direction of travel, from x towards y: axes that are mounted askew.
+    backlash_m
+        (x, y) play between motor and stage: after a reversal an axis stands still for so much commanded travel.
+    """
+
+    gain: tuple[float, float] = (1.0, 1.0)
+    turned_rad: float = 0.0
+    backlash_m: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        values = np.array([*self.gain, self.turned_rad, *self.backlash_m])
+        if not np.all(np.isfinite(values)) or min(self.gain) <= 0.0 or min(self.backlash_m) < 0.0:
+            raise InvalidValueError(
+                f"{self}", expected="finite gains above 0, and finite play of 0 or more"
+            )
+
+
+class StageActuator:
+    """Turns commanded velocities into those of the stage.
+
+    Parameters
+    ----------
+    faults
+        What is wrong with it. Its axes are in gear in the positive direction at first.
+    """
+
+    def __init__(self, faults: ActuatorFaults | None = None) -> None:
+        self._faults = faults or ActuatorFaults()
+        self._slack_m = np.array(self._faults.backlash_m)
+
+    def obey(
+        self, velocity_m_s: tuple[float, float], start_s: float, end_s: float
+    ) -> list[tuple[float, tuple[float, float]]]:
+        """Follow a command from ``start_s`` until the next one at ``end_s``.
+
+        Returns
+        -------
+        Times within, the first ``start_s``, and the (x, y) velocity of the stage from each on, m/s.
+        """
+        command = np.array(velocity_m_s, dtype=np.float64)
+        play = np.array(self._faults.backlash_m)
+        # In gear in the positive direction where the slack is all taken up, in the negative where it is zero.
+        left_m = np.where(command > 0.0, play - self._slack_m, self._slack_m)
+        engaged_s = start_s + np.where(
+            command == 0.0, math.inf, left_m / np.maximum(np.abs(command), 1e-30)
+        )
+        times = sorted({start_s, *(float(t) for t in engaged_s if start_s < t < end_s)})
+        moved = [(t, self._travel(np.where(engaged_s <= t, command, 0.0))) for t in times]
+        self._slack_m = np.clip(self._slack_m + command * (end_s - start_s), 0.0, play)
+        return moved
+
+    def _travel(self, motor_m_s: Array) -> tuple[float, float]:
+        x, y = motor_m_s * np.array(self._faults.gain)
+        c, s = math.cos(self._faults.turned_rad), math.sin(self._faults.turned_rad)
+        return float(c * x - s * y), float(s * x + c * y)
+
+
+def grid_view(
+    camera: ScanCamera,
+    rotation: Array,
+    translation_m: Array,
+    *,
+    square_px: float = 40.0,
+    noise_px: float = 0.0,
+    rng: np.random.Generator | None = None,
+    name: str = "",
+    project: Callable[[Array], Array] | None = None,
+) -> GridView:
+    """Return all lattice corners inside the image, with Gaussian noise on their pixels.
+
+    ``project`` takes the place of the camera's own projection of sem-frame points.
+    """
+    square_m = square_px / camera.m
+    i, j = np.meshgrid(np.arange(-40, 41), np.arange(-40, 41))
+    board: Array = np.column_stack([i.ravel(), j.ravel()]).astype(float) * square_m
+    points = np.column_stack([board, np.zeros(len(board))]) @ rotation.T + translation_m
+    xy = (project or camera.project)(points)
+    with np.errstate(invalid="ignore"):
+        seen = np.all((xy > 5) & (xy < np.array([camera.width, camera.height]) - 6), axis=1)
+    xy = xy[seen]
+    if noise_px > 0.0:
+        assert rng is not None
+        xy = xy + rng.normal(scale=noise_px, size=xy.shape)
+    sigma = np.full(len(xy), noise_px if noise_px > 0.0 else 0.01)
+    return GridView(camera.magnification, board[seen].astype(np.float64), xy, sigma, name)
+
+
+def grid_views(
+    camera_at: Callable[[float], ScanCamera],
+    magnifications: Sequence[float],
+    *,
+    views: int = 4,
+    noise_px: float = 0.0,
+    height_sigma_m: float = 40e-6,
+    square_px: float = 40.0,
+    seed: int = 0,
+    flat_height_sigma_m: float = 0.0,
+    project: Callable[[float, Array], Array] | None = None,
+) -> list[GridView]:
+    """``views`` random poses per magnification, the first untilted, tilts up to 40 degrees.
+
+    The heights have the sigma ``height_sigma_m``, those of the untilted views ``flat_height_sigma_m``. ``project``
+    takes the place of the cameras' projection: of sem-frame points at a magnification, as of a whole microscope.
+    """
+    rng = np.random.default_rng(seed)
+    # A separate generator: the poses of a seed are the same with and without noise.
+    noise_rng = np.random.default_rng(seed + 1_000_000)
+    out = []
+    for g in magnifications:
+        camera = camera_at(g)
+        for k in range(views):
+            tilt = 0.0 if k == 0 else rng.uniform(np.radians(15), np.radians(40))
+            axis = rng.uniform(0, 2 * np.pi)
+            turn = rotations_from_vectors(np.array([[0.0, 0.0, rng.uniform(-0.6, 0.6)]]))[0]
+            tilted = rotations_from_vectors(tilt * np.array([[np.cos(axis), np.sin(axis), 0.0]]))[0]
+            centre = rng.uniform(-0.5, 0.5, size=2) * square_px / camera.m
+            # Without its own height sigma, the first view draws no number, so that seeds keep their poses.
+            sigma = flat_height_sigma_m if k == 0 else height_sigma_m
+            translation = np.array([*centre, rng.normal() * sigma if sigma > 0.0 else 0.0])
+            out.append(
+                grid_view(
+                    camera,
+                    tilted @ turn,
+                    translation,
+                    square_px=square_px,
+                    noise_px=noise_px,
+                    rng=noise_rng,
+                    name=f"{g:g}/{k}",
+                    project=None if project is None else partial(project, g),
+                )
+            )
+    return out

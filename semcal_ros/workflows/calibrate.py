@@ -22,6 +22,7 @@ from typing import Annotated
 
 import numpy as np
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import check_positive
@@ -36,11 +37,7 @@ from semcal_ros.core.calibration.options import (
 )
 from semcal_ros.core.calibration.pipeline import are_enough, calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.start import (
-    check_nominal_scale,
-    check_square_sides,
-    is_scale_far,
-)
+from semcal_ros.core.calibration.start import check_nominal_scale, check_square_sides, is_scale_far
 from semcal_ros.core.calibration.thresholds import VIEWS_MIN
 from semcal_ros.core.calibration.views import (
     FoundView,
@@ -49,7 +46,7 @@ from semcal_ros.core.calibration.views import (
     SquareAssignment,
     assign_squares,
 )
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.corners import PATTERN_NAMES
 from semcal_ros.core.errors import (
     CalibrationError,
@@ -59,7 +56,6 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import (
     PATTERN,
     UNTILTED,

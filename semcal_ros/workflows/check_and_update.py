@@ -28,10 +28,9 @@ from semcal_ros.core.calibration.judgement.thresholds import DEFAULT_AGEING
 from semcal_ros.core.calibration.judgement.update import CalibrationUpdate, update_calibration
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import FoundView, GridView, RejectedView
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.calibrate import name_untilted, options_for
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.find_grid import (
     PATTERN_AGAIN,
     UNTILTED,
@@ -53,7 +52,11 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 from semcal_ros.workflows.options import CONFIG, PROGRESS, SQUARES, KeywordsOf, Option
-from semcal_ros.workflows.provenance import describe_computation, describe_provenance
+from semcal_ros.workflows.provenance import (
+    ConditionsComparison,
+    describe_computation,
+    describe_provenance,
+)
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.core.errors import UnknownScaleError
 from semcal_ros.files.bags.reader import BagTopic
 from semcal_ros.files.recordings import FrameOutline, RecordedFiles, Recording
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import count_visits
 from semcal_ros.workflows.inputs import (
     ConfigSource,
@@ -161,7 +161,7 @@ class RecordingSummary:
         Number of frames whose grey levels were read.
     conditions
         How the frames were taken, as far as their files say it, under the names of
-        :class:`~semcal_ros.files.tiff.sem_image.Conditions`: the different texts, or the least and the
+        :class:`~semcal_ros.bridge.conditions.Conditions`: the different texts, or the least and the
         greatest number. The tilt of a bag is that of its stage.
     file_bytes
         Size of the recording on disk; None for images in memory.

@@ -26,8 +26,7 @@ from semcal_ros.core.calibration.judgement.evaluate import (
     rms_by_magnification,
 )
 from semcal_ros.core.calibration.views import RejectedView, refuse_tilted_lines
-from semcal_ros.core.camera.fit_record import FitRecord
-from semcal_ros.workflows.conditions import ConditionsComparison
+from semcal_ros.core.camera.records import FitRecord
 from semcal_ros.workflows.find_grid import PATTERN_AGAIN, collect_views, find_views, named_frames
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -43,6 +42,7 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 from semcal_ros.workflows.options import CONFIG, DASK, MAGNIFICATION, PROGRESS, SQUARES, KeywordsOf
+from semcal_ros.workflows.provenance import ConditionsComparison
 from semcal_ros.workflows.workers import open_workers
 
 # 1-sigma of the heights on a stage if the calibration does not contain it.

@@ -19,17 +19,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.files.recordings import RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
     ConfigSource,
@@ -41,7 +40,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
-from semcal_ros.workflows.provenance import describe_provenance
+from semcal_ros.workflows.provenance import ConditionsComparison, describe_provenance
 
 # Digits of a magnification: the same setting is the same number, however a file rounds it.
 _DIGITS = 9

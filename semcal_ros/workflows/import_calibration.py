@@ -18,13 +18,15 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.core.camera.nominal_calibration import KnownPixelSize, make_nominal_calibration
+from semcal_ros.core.camera.calibration_model import KnownPixelSize, make_nominal_calibration
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.files.tables import read_table
+from semcal_ros.workflows.options import KeywordsOf, Option
 from semcal_ros.workflows.provenance import describe_computation
 
 _METRES = {"pm": 1e-12, "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 1e-3, "m": 1.0}
@@ -32,13 +34,34 @@ _METRES = {"pm": 1e-12, "nm": 1e-9, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "mm": 
 _UNIT = re.compile(r"(?<![a-zµμ])(pm|nm|um|µm|μm|mm|m)(?![a-zµμ])")
 
 
-def import_calibration(
-    table: str | os.PathLike[str],
-    *,
-    image_size: tuple[int, int],
-    sigma: float,
-    display_width_m: float | None = None,
-) -> Calibration:
+@dataclass(frozen=True)
+class ImportOptions:
+    """What a table of pixel sizes does not tell."""
+
+    image_size: Annotated[
+        tuple[int, int],
+        Option(
+            "Size of the images whose pixels these are, without databar, such as 1024x768.",
+            kind="image size",
+            required=True,
+            python="(width, height) in px.",
+        ),
+    ]
+    sigma: Annotated[
+        float,
+        Option("Relative 1-sigma of pixel sizes for which the table has none.", kind="ratio"),
+    ] = 0.03
+    display_width_m: Annotated[
+        float | None,
+        Option(
+            "Width of the display that the magnification refers to (default: the one that fits).",
+            kind="length",
+        ),
+    ] = None
+
+
+@KeywordsOf(ImportOptions)
+def import_calibration(table: str | os.PathLike[str], options: ImportOptions) -> Calibration:
     """Make a nominal calibration from a table of magnifications and pixel sizes.
 
     Parameters
@@ -47,12 +70,6 @@ def import_calibration(
         A ``.csv``, ``.parquet`` or ``.xlsx`` file with a column of magnifications and one of pixel sizes, whose header
         names the unit, such as ``nm per px``; optionally one of their 1-sigma, in ``%``, in
         the unit that its header names, or else in that of the sizes.
-    image_size
-        (width, height) of the images whose pixels they are, px.
-    sigma
-        Relative 1-sigma of the sizes that have none of their own.
-    display_width_m
-        As for :func:`.make_nominal_calibration`.
 
     Raises
     ------
@@ -82,14 +99,14 @@ def import_calibration(
         if len(row) <= max(magnification, size):
             raise InvalidValueError(f"{where}{len(row)} values", expected=f"{len(columns)}")
         value_m = unit * _number(row[size], where)
-        relative_sigma = sigma
+        relative_sigma = options.sigma
         if spreads and len(row) > spreads[0] and row[spreads[0]].strip():
             spread = _number(row[spreads[0]], where)
             relative_sigma = 0.01 * spread if percent else spread_unit * spread / value_m
         known.append(
             KnownPixelSize(_number(row[magnification], where), value_m, relative_sigma, where)
         )
-    model = make_nominal_calibration(known, image_size, display_width_m)
+    model = make_nominal_calibration(known, options.image_size, options.display_width_m)
     origin = replace(describe_computation(), recording=f"{path.name} (a table of pixel sizes)")
     return Calibration.from_model(replace(model, provenance=origin))
 

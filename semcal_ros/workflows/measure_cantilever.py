@@ -42,7 +42,6 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
 from semcal_ros.files.tables import write_table
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.follow_drift import GIVE_FRAME_TIME, camera_for, start_time_s
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -64,6 +63,7 @@ from semcal_ros.workflows.options import (
     KeywordsOf,
     Option,
 )
+from semcal_ros.workflows.provenance import ConditionsComparison
 
 #: Columns of the table of ``semcal measure cantilever``.
 CANTILEVER_COLUMNS = (

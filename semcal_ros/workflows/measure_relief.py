@@ -32,7 +32,6 @@ from semcal_ros.files.images.write import TIFF_SUFFIXES, PixelScale, open_tiff_s
 from semcal_ros.files.meshes import UNITS_PER_M, save_cloud
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.files.tables import TABLE_SUFFIXES, write_table
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.follow_drift import camera_for
 from semcal_ros.workflows.inputs import (
     CalibrationSource,
@@ -45,6 +44,7 @@ from semcal_ros.workflows.inputs import (
     resolve_config,
 )
 from semcal_ros.workflows.options import CONFIG, PROGRESS, Keyword, KeywordsOf, Option
+from semcal_ros.workflows.provenance import ConditionsComparison
 
 #: Suffixes of what a relief is written to: a height map, a cloud of points, tables of points.
 RELIEF_SUFFIXES = (*TIFF_SUFFIXES, ".ply", *TABLE_SUFFIXES)

@@ -42,6 +42,7 @@ from typing import (
 Given = ParamSpec("Given")
 Options = TypeVar("Options")
 First = TypeVar("First")
+Second = TypeVar("Second")
 Source = TypeVar("Source")
 Result = TypeVar("Result")
 
@@ -164,7 +165,7 @@ def option_fields(kind: type, meanings: Mapping[str, Keyword] | None = None) -> 
 
 
 class KeywordsOf(Generic[Given, Options]):
-    """Lets a function of one or two things and a dataclass of options take the fields of the dataclass as keywords.
+    """Lets a function of up to three things and a dataclass of options take the fields of the dataclass as keywords.
 
     The docstring of the function gets a list of the keywords and what they mean; the dataclass is its attribute
     ``options``.
@@ -198,6 +199,11 @@ class KeywordsOf(Generic[Given, Options]):
     def __call__(
         self, function: Callable[[First, Source, Options], Result]
     ) -> Callable[Concatenate[First, Source, Given], Result]: ...
+
+    @overload
+    def __call__(
+        self, function: Callable[[First, Second, Source, Options], Result]
+    ) -> Callable[Concatenate[First, Second, Source, Given], Result]: ...
 
     def __call__(self, function: Callable[..., Result]) -> Callable[..., Result]:
         """Return the function with these keywords."""

@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where a calibration comes from: its recording, configuration and conditions."""
+"""Where a calibration comes from: its recording, configuration and conditions; and whether another recording was taken
+under the same conditions.
+
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,15 @@ from pathlib import Path
 from typing import Any
 
 import semcal_ros
+from semcal_ros.bridge.conditions import Conditions
+from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.conditions import compare_conditions
+from semcal_ros.core.camera.records import Provenance
+from semcal_ros.core.wording import printable
 from semcal_ros.files.images.image_series import find_image_files
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.inputs import Source
 
 # Stamps before 2001 count from the start of a recording, not from 1970.
@@ -40,6 +46,9 @@ _FIRST_DATE_NS = 978_307_200_000_000_000
 _BAG_DATA = frozenset({".mcap", ".db3"})
 # The longest text of the calibration file.
 _MOST_CHARACTERS = 1000
+
+# Differences that a note names: those of a recording whose conditions change from frame to frame are no list to read.
+_MOST_NAMED = 4
 
 
 def describe_computation() -> Provenance:
@@ -169,3 +178,55 @@ def sum_up_conditions(
         if tilted is None and stage is not None and stage.tilt_rad is not None:
             found.setdefault("stage_tilt_rad", set()).add(stage.tilt_rad)
     return {name: sum_up(values) for name, values in found.items()}
+
+
+class ConditionsComparison:
+    """Compares the conditions of frames with those of a calibration; what one of them does not tell is not compared.
+
+    Parameters
+    ----------
+    calibration
+        None: nothing is compared.
+    scans_may_turn
+        Whether a rotation of the scan is no other condition.
+    """
+
+    def __init__(self, calibration: Calibration | None, *, scans_may_turn: bool = False) -> None:
+        self._calibration = calibration
+        self._scans_may_turn = scans_may_turn
+        self._last: Conditions | None = None
+        self._found: dict[str, bool] = {}
+
+    def add(self, conditions: Conditions | None) -> None:
+        """Take the conditions of a frame."""
+        if conditions is not None and self._scans_may_turn:
+            conditions = replace(conditions, scan_rotation_rad=None)
+        if self._calibration is None or conditions is None or conditions == self._last:
+            return
+        self._last = conditions
+        found = compare_conditions(
+            self._calibration.provenance.conditions,
+            {name: value for name, value in asdict(conditions).items() if value not in (None, "")},
+            height_sigma_m=self._calibration.scale_sigma.height_m,
+        )
+        self._found |= {difference.text: difference.decisive for difference in found}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the user: one of what may change the scale, one of what does not."""
+        decisive = self._name(True)
+        others = self._name(False)
+        out = []
+        if decisive:
+            out.append(
+                f"other conditions than those of the calibration: {decisive}; check it (semcal check), or use one that "
+                "was made under these conditions"
+            )
+        if others:
+            out.append(f"different from the calibration: {others}")
+        return tuple(printable(note) for note in out)
+
+    def _name(self, decisive: bool) -> str:
+        texts = [text for text, is_decisive in self._found.items() if is_decisive is decisive]
+        more = len(texts) - _MOST_NAMED
+        return ", ".join(texts[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -24,7 +24,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from semcal_ros.bridge.names import absolute_namespace
+from semcal_ros.bridge.fields import absolute_namespace
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
@@ -33,8 +33,7 @@ from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.corrected import CorrectedBagWriter
-from semcal_ros.files.bags.writer import BagWriter
+from semcal_ros.files.bags.writer import BagWriter, CorrectedBagWriter
 from semcal_ros.files.images.image_file import is_image_file
 from semcal_ros.files.images.write import (
     TIFF_SUFFIXES,
@@ -46,7 +45,6 @@ from semcal_ros.files.images.write import (
 )
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.files.tables import TABLE_SUFFIXES
-from semcal_ros.workflows.conditions import ConditionsComparison
 from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     DriftFollower,
@@ -75,6 +73,7 @@ from semcal_ros.workflows.options import (
     KeywordsOf,
     Option,
 )
+from semcal_ros.workflows.provenance import ConditionsComparison
 from semcal_ros.workflows.workers import open_workers
 
 

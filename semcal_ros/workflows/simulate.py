@@ -25,7 +25,7 @@ from typing import Annotated
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import (
     CALIBRATION_MAGNIFICATIONS,
     DRIFTS,
@@ -49,12 +49,7 @@ from semcal_ros.synthetic import (
     truth_of,
     zoom_plan,
 )
-from semcal_ros.workflows.inputs import (
-    OnProgress,
-    check_positives,
-    count_frames,
-    ignore_progress,
-)
+from semcal_ros.workflows.inputs import OnProgress, check_positives, count_frames, ignore_progress
 from semcal_ros.workflows.options import OVERWRITE, PROGRESS, Keyword, KeywordsOf, Option
 
 #: Chess grid at many poses; one place under drift; steps of the magnification; a sweep of it; a specimen beyond the

@@ -21,11 +21,7 @@ from typing import Any
 
 import pytest
 
-from semcal_ros.bridge.diagnostics import (
-    DiagnosticLevel,
-    StreamStatistics,
-    fill_diagnostic_status,
-)
+from semcal_ros.bridge.diagnostics import DiagnosticLevel, StreamStatistics, fill_diagnostic_status
 from semcal_ros.core.errors import InvalidValueError
 
 

@@ -26,12 +26,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcal_ros.bridge.calibration_text import (
+from semcal_ros.bridge.calibration import (
     MAX_TEXT_BYTES,
     calibration_text_from_message,
     fill_calibration_text,
 )
-from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import (
     UNKNOWN_VARIANCE,
     fill_drift,
@@ -39,14 +38,14 @@ from semcal_ros.bridge.drift import (
     rotation_of,
     rotation_rate_of,
 )
-from semcal_ros.bridge.fields import new_nested
-from semcal_ros.bridge.headers import (
+from semcal_ros.bridge.fields import (
     fill_header,
     fill_stamp,
+    new_nested,
     optional_stamp_ns,
     stamp_ns_from_msg,
 )
-from semcal_ros.bridge.projection import fill_projection, projection_from_message
+from semcal_ros.bridge.projection import fill_camera_info, fill_projection, projection_from_message
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.files.bags.messages import blank_message, jazzy_types, serialize_message

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.projection import (
+    fill_camera_info,
     fill_projection,
     fill_projection_covariance,
     fill_stamped_projection,

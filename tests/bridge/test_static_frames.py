@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.static_frames import fill_static_frames, static_frames
+from semcal_ros.bridge.projection import fill_static_frames, static_frames
 from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.messages import blank_message

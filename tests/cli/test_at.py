@@ -23,7 +23,7 @@ import pytest
 
 from semcal_ros import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.camera.residual_field import zero_field
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run

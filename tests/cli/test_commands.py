@@ -30,7 +30,7 @@ import pytest
 import yaml
 
 from semcal_ros import Calibration
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.workflows.simulate import simulate
 from tests.helpers.made_once import folder_once

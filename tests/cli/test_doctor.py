@@ -63,7 +63,7 @@ from semcal_ros.doctor.stream_checks import (
     check_transport_time,
     describe_magnifications,
 )
-from semcal_ros.middleware.transport_advice import PROFILE_VARIABLES
+from semcal_ros.middleware import PROFILE_VARIABLES
 from semcal_ros.workflows.simulate import simulate
 from tests.helpers.node_scenes import make_calibration, write_recording
 from tests.helpers.project import NODES, ROOT

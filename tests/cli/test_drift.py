@@ -30,7 +30,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from semcal_ros.bridge.headers import fill_header, stamp_ns_from_msg
+from semcal_ros.bridge.fields import fill_header, stamp_ns_from_msg
 from semcal_ros.bridge.images import fill_image, image_from_message
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath
@@ -40,7 +40,7 @@ from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.video import VideoWriter
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.workflows.track_drift import describe_rate
-from tests.files.tiff.test_to_bag import write_tescan
+from tests.files.images.test_to_bag import write_tescan
 from tests.helpers.drift_scenes import make_drift_update
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import refused, run

@@ -28,7 +28,7 @@ import tifffile
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import Drift, preset
 from semcal_ros.synthetic.specimens.cantilever import CantileverPlan, cantilever_plan
 from tests.helpers.semcal_runs import refused, run

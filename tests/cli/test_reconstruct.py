@@ -26,7 +26,7 @@ import trimesh
 
 from semcal_ros.applications.reconstruction import Roundness, SurfaceMesh
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.files.meshes import encode_mesh, save_cloud, save_mesh
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.drift import drift_preset

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from semcal_ros import Calibration
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.cli import main
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.files.bags.reader import open_bag

@@ -34,11 +34,12 @@ from semcal_ros.config.config import (
     MicroscopeConfig,
     StageConfig,
     StageSigmas,
+    config_names,
     config_schema,
     load_config,
+    load_yaml,
     parse_config,
 )
-from semcal_ros.config.files import config_names, load_yaml
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import ConfigError
 

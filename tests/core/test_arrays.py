@@ -19,13 +19,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.arrays import (
-    check_image,
-    equilibrate,
-    invert_scaled,
-    mad_sigma,
-    solve_scaled,
-)
+from semcal_ros.core.arrays import check_image, equilibrate, invert_scaled, mad_sigma, solve_scaled
 from semcal_ros.core.errors import InvalidValueError
 
 # Metres beside pixels beside radians.

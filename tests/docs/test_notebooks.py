@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.notebooks import follow_notebook
+from tests.helpers.listings import follow_notebook
 from tests.helpers.project import ROOT
 
 FOLDER = ROOT / "doc" / "tutorials"

@@ -30,9 +30,8 @@ import pytest
 import yaml
 
 from examples.cantilever.figure_16a import SCALES, compare_calibrations, root_mean_square_nm
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS
-from tests.helpers.listings import listings, run_page
-from tests.helpers.notebooks import follow_notebook
+from semcal_ros.files.bags.writer import SIMULATED_START_NS
+from tests.helpers.listings import follow_notebook, listings, run_page
 from tests.helpers.ros_domain import claim_domain
 
 # They make their recordings and calibrations themselves.

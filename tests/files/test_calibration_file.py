@@ -23,17 +23,17 @@ import pytest
 import yaml
 
 from semcal_ros import Calibration, SemcalError
-from semcal_ros.bridge.calibration_text import MAX_TEXT_BYTES
+from semcal_ros.bridge.calibration import MAX_TEXT_BYTES
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, TERM_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.errors import CalibrationFileError
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 
 @pytest.fixture(scope="module", params=["joint", "discrete", "pda"])

@@ -28,8 +28,7 @@ import pytest
 from semcal_ros.config.config import ImageConfig, MagnificationConfig, MicroscopeConfig
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.messages import blank_message
-from semcal_ros.files.bags.reader import BagTopic
-from semcal_ros.files.bags.topics import find_topic, topic_matches
+from semcal_ros.files.bags.reader import BagTopic, find_topic, topic_matches
 from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFrame, open_recording
 

@@ -25,7 +25,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semcal_ros.bridge.compressed import fill_compressed
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import ENCODINGS, fill_image
 from semcal_ros.cli.main import main
 from semcal_ros.config.config import (

@@ -29,8 +29,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from semcal_ros.bridge.magnification import read_magnification
-from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
-from semcal_ros.config.files import config_directories, find_config_file
+from semcal_ros.config.config import (
+    MicroscopeConfig,
+    config_directories,
+    find_config_file,
+    load_config,
+    parse_config,
+)
 from semcal_ros.core.errors import SemcalError
 from tests.helpers.fuzz_inputs import (
     YAML_PIECES,

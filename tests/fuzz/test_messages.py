@@ -26,14 +26,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from semcal_ros.bridge.calibration_text import (
+from semcal_ros.bridge.calibration import (
     MAX_TEXT_BYTES,
     calibration_text_from_message,
     fill_calibration_text,
 )
-from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.images import (
     ENCODINGS,
     fill_image,
@@ -43,6 +42,7 @@ from semcal_ros.bridge.images import (
 )
 from semcal_ros.bridge.magnification import MAGNIFICATION_LIMITS, read_magnification
 from semcal_ros.bridge.projection import (
+    fill_camera_info,
     fill_projection,
     fill_stamped_projection,
     projection_from_message,

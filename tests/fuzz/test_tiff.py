@@ -32,16 +32,11 @@ from hypothesis import strategies as st
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.images.image_file import read_plain_image
+from semcal_ros.files.images.metadata import PIXEL_SIZE_RANGE_M, plain_number, quantity
+from semcal_ros.files.images.sem_image import SemImage
 from semcal_ros.files.images.to_bag import METADATA_TOPIC, import_images
 from semcal_ros.files.recordings import RecordedFiles
-from semcal_ros.files.tiff.read import (
-    read_page_settings,
-    read_sem_pages,
-    read_sem_settings,
-    read_sem_tiff,
-)
-from semcal_ros.files.tiff.sem_image import SemImage
-from semcal_ros.files.tiff.values import PIXEL_SIZE_RANGE_M, plain_number, quantity
+from semcal_ros.files.tiff.read import read_page_settings, read_sem_pages, read_sem_tiff
 from tests.helpers.fuzz_inputs import changed, damaged, edited_text
 from tests.helpers.fuzz_support import attempt, fuzz, run_semcal
 
@@ -262,7 +257,7 @@ def _check(image: SemImage) -> None:
 
 
 def _read(path: Path) -> SemImage:
-    settings, size_px = read_sem_settings(path)
+    (_, settings, size_px), *_ = read_page_settings(path)
     image = read_sem_tiff(path)
     _check(image)
     assert image.settings == settings

@@ -24,7 +24,7 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.made_once import made_once
 
 NOISE_PX = 0.05

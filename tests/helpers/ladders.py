@@ -30,7 +30,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.ladder.matching import LadderPicture
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.made_once import made_once
 
 __all__ = [

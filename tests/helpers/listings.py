@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The listings of a page: its commands, run as a reader would, and their output beside what the page shows.
+"""The listings of a page, and notebooks: run as a reader would, and their output beside what is shown.
 
 A listing is indented by four columns. A command begins with ``$ `` and may go on after a backslash; the lines up to the
 next command are its output. ``...`` stands for any lines. A command that shows no output may print anything.
@@ -29,9 +29,12 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from semcal_ros.cli.main import main
-from tests.helpers.project import ROOT
+from tests.helpers.project import ROOT, load_script
 
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
@@ -150,3 +153,37 @@ def run_page(page: Path, folder: Path, tolerance: float, but: tuple[str, ...] = 
             run_listing(listed, folder, tolerance)
             count += 1
     return count
+
+
+def follow_notebook(path: Path, folder: Path, tolerance: float, but: str = "") -> int:
+    """Run a notebook in a folder, but for cells that begin with ``but``; return how many lines and pictures agree.
+
+    Raises
+    ------
+    AssertionError
+        A cell fails, prints or draws something else.
+    """
+    # `colcon test` has no IPython.
+    pytest.importorskip("IPython")
+    module = load_script("run_notebooks")
+    kept = module.read_notebook(path)
+    done = module.run_notebook(path, folder, but)
+    compared = 0
+    for before, now in zip(kept["cells"], done["cells"], strict=True):
+        if before["cell_type"] != "code":
+            continue
+        printed = _printed(now)
+        assert differences(tuple(_printed(before)), printed, tolerance) == [], printed
+        assert _kinds(before) == _kinds(now)
+        compared += len(printed) + len(_kinds(now))
+    return compared
+
+
+def _printed(cell: dict[str, Any]) -> list[str]:
+    texts = "".join("".join(o["text"]) for o in cell["outputs"] if o["output_type"] == "stream")
+    return [line.rstrip() for line in texts.splitlines() if line.strip()]
+
+
+def _kinds(cell: dict[str, Any]) -> list[list[str]]:
+    """Of each picture or table of a cell, as what it can be shown."""
+    return [sorted(output["data"]) for output in cell["outputs"] if "data" in output]

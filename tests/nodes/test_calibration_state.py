@@ -26,6 +26,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.acquisition import ViewRequest
@@ -33,7 +34,6 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejection
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.recorded import RecordedView
 from semcal_ros.nodes.calibration_state import CalibrationState, LadderSource
 from semcal_ros.nodes.workers.calibration_worker import CalibrationJob, ExtensionJob, Stage

@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Float64
 
-from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
+from semcal_ros.core.camera.pinhole_model import fit_plumb_bob
 from tests.helpers.node_scenes import (
     SIZE,
     image_message,

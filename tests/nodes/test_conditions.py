@@ -28,7 +28,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions, read_conditions
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 from tests.helpers.node_scenes import (

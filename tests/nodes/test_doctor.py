@@ -33,7 +33,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 
-from semcal_ros.bridge.headers import fill_stamp
+from semcal_ros.bridge.fields import fill_stamp
 from tests.helpers.node_scenes import (
     image_message,
     magnification_message,

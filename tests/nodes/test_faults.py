@@ -29,7 +29,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, String
 
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.core.rectification.rectifier import Rectifier
 from tests.helpers.node_scenes import (
     RANGE,

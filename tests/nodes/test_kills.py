@@ -27,11 +27,7 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 
 from semcal_ros.calibration import Calibration
 from tests.helpers.long_tests import long_but
-from tests.helpers.node_scenes import (
-    magnification_message,
-    stamp_of,
-    texture,
-)
+from tests.helpers.node_scenes import magnification_message, stamp_of, texture
 from tests.helpers.ros_process import LATCHED, PATIENT, Peer, running
 from tests.helpers.stream_bench import (
     CALIBRATION,

@@ -26,7 +26,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64
 
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.config.config import load_config
 from semcal_ros.synthetic import Detector, calibration_plan, preset
 from tests.helpers.node_scenes import (

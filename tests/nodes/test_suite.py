@@ -31,7 +31,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.projection import stamped_projection_from_message
 from tests.helpers.installed_package import write_consumers
 from tests.helpers.node_scenes import make_calibration

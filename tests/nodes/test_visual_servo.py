@@ -31,9 +31,9 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64, Float64MultiArray
 
-from semcal_ros.bridge.camera_info import fill_camera_info
 from semcal_ros.bridge.drift import fill_drift
 from semcal_ros.bridge.projection import (
+    fill_camera_info,
     fill_projection,
     fill_stamped_projection,
     fill_stamped_projection_covariance,

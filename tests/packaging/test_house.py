@@ -129,5 +129,5 @@ def test_two_trees_stand_side_by_side(
 def test_a_commit_is_read_without_a_change_of_the_tree(house: ModuleType) -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("no repository")
-    modules = house.read_commit("HEAD", "config")
-    assert "config/config.py" in {module.path for module in modules}
+    modules = house.read_commit("HEAD", "client")
+    assert "client/stream.py" in {module.path for module in modules}

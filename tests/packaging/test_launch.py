@@ -30,7 +30,7 @@ from xml.etree import ElementTree
 import pytest
 from ament_index_python import get_package_prefix
 
-from semcal_ros.config.files import load_yaml
+from semcal_ros.config.config import load_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITE = ROOT / "launch" / "semcal_launch.py"

@@ -163,10 +163,8 @@ def test_ros_is_imported_by_nodes_and_the_listener_only() -> None:
 
 def test_middleware_needs_no_ros() -> None:
     """The doctor uses it, which must work where ROS does not."""
-    code = BLOCKER.replace("semcal_ros.core", "semcal_ros.middleware")
-    done = _run(code)
+    done = _run(BLOCKER.partition("import semcal_ros.core")[0] + "import semcal_ros.middleware\n")
     assert done.returncode == 0, done.stderr
-    assert "semcal_ros.middleware.transport_advice" in done.stdout.split()
 
 
 def test_the_doctor_works_without_ros() -> None:

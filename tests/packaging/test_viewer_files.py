@@ -25,7 +25,7 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from semcal_ros.nodes.common.help import EXECUTABLES
+from semcal_ros.nodes.common.command_line import EXECUTABLES
 from tests.helpers.project import ROOT
 
 FOLDER = ROOT / "viewers"

@@ -26,14 +26,7 @@ from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.report import write_calibration_report
 from tests.helpers.made_once import folder_once, made_once
-from tests.helpers.report_samples import (
-    DISPLAY_M,
-    HOSTILE,
-    SIZE,
-    found_of,
-    grid_view,
-    unused,
-)
+from tests.helpers.report_samples import DISPLAY_M, HOSTILE, SIZE, found_of, grid_view, unused
 
 
 @pytest.fixture(scope="session")

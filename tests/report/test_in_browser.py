@@ -28,8 +28,7 @@ import pytest
 from examples.demo.correction_page import DemoRow, write_correction_report
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.report.calibration.numbers import tabulate_cameras
-from semcal_ros.report.html.page import render
-from semcal_ros.report.html.text import format_length
+from semcal_ros.report.html.page import format_length, render
 from tests.helpers.chromium import chromium
 
 BROWSER = next(

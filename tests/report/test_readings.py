@@ -28,11 +28,11 @@ from PIL import Image
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.report.calibration.error_figures import plot_distortion, plot_rms
-from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
+from semcal_ros.report.calibration.numbers import compute_rms_without_distortion
 from semcal_ros.report.calibration.parameter_figures import plot_pixel_sizes
 from semcal_ros.report.html.encode import Readings, encode_figure
+from semcal_ros.report.html.page import format_length
 from semcal_ros.report.html.style import create_figure, style_axes
-from semcal_ros.report.html.text import format_length
 
 
 def test_strips_lie_around_the_points_in_the_file() -> None:

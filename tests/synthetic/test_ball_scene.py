@@ -27,13 +27,13 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import NOISE_FREE
 from semcal_ros.synthetic.drift import Drift
 from semcal_ros.synthetic.specimens.ball import (
+    TEXTURES,
     BallOnTip,
     Turning,
     ball_microscope,
     ball_plan,
     draw_ball_plan,
 )
-from semcal_ros.synthetic.specimens.ball_body import TEXTURES
 
 # The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")

@@ -22,8 +22,14 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.synthetic.specimens.cantilever import BeamTip, CantileverScene, Charging
-from semcal_ros.synthetic.specimens.cantilever_random import TIPS, make_tip, random_cantilever
+from semcal_ros.synthetic.specimens.cantilever import (
+    TIPS,
+    BeamTip,
+    CantileverScene,
+    Charging,
+    make_tip,
+    random_cantilever,
+)
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
 
 PLAIN = CantileverScene(background=0.0, rim=0.0, beam=1.0, holder=1.0, pusher=0.5)

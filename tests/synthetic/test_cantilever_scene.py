@@ -27,7 +27,7 @@ from semcal_ros.synthetic import NOISE_FREE, Drift, preset
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_reflectivity
 from semcal_ros.synthetic.specimens.cantilever import CantileverScene, cantilever_plan
-from semcal_ros.synthetic.specimens.thresholds import CANTILEVER_MAGNIFICATIONS, CANTILEVER_PUSHES
+from semcal_ros.synthetic.thresholds import CANTILEVER_MAGNIFICATIONS, CANTILEVER_PUSHES
 
 # A plain beam: no texture, no rims.
 PLAIN = CantileverScene(background=0.0, rim=0.0, beam=1.0, holder=1.0, pusher=0.5)

@@ -35,7 +35,7 @@ from semcal_ros.synthetic import (
     render_reflectivity,
     square_for,
 )
-from semcal_ros.synthetic.specimens.ray_lattice import trace_ray_lattice
+from semcal_ros.synthetic.render import trace_ray_lattice
 
 REACH_PX = 4.0
 STEPS = np.linspace(-REACH_PX, REACH_PX, 81)

@@ -47,8 +47,8 @@ from semcal_ros.synthetic import (
     truth_of,
 )
 from semcal_ros.synthetic.detector import _shift_lines
-from semcal_ros.synthetic.specimens.ray_lattice import trace_ray_lattice
-from semcal_ros.synthetic.stage import visit_scales
+from semcal_ros.synthetic.render import trace_ray_lattice
+from semcal_ros.synthetic.stage import ActuatorFaults, StageActuator, visit_scales
 
 ONE_AXIS, TWO_AXIS = STAGES["one-axis"], STAGES["two-axis"]
 SCOPE = preset("jsm820")
@@ -419,3 +419,36 @@ def test_a_frame_that_is_being_scanned_shows_the_specimen_before_it_is_tilted():
     # The clock of a simulation may begin anew.
     scene.set_pose(flat, 2.0)
     assert scene.frame(12.0).pose.tilt_rad < 1e-7
+
+
+def travel(pieces: list[tuple[float, tuple[float, float]]], end_s: float) -> np.ndarray:
+    ends = [*(t for t, _ in pieces[1:]), end_s]
+    steps = zip(pieces, ends, strict=True)
+    return np.sum([(end - begin) * np.array(v) for (begin, v), end in steps], axis=0)
+
+
+def test_a_perfect_stage_does_what_it_is_told() -> None:
+    assert StageActuator().obey((1e-6, -2e-6), 3.0, 4.0) == [(3.0, (1e-6, -2e-6))]
+
+
+def test_gain_and_direction() -> None:
+    stage = StageActuator(ActuatorFaults(gain=(1.1, 0.9), turned_rad=math.radians(90.0)))
+    ((_, velocity),) = stage.obey((1.0, 1.0), 0.0, 1.0)
+    assert velocity == pytest.approx((-0.9, 1.1))
+
+
+def test_play_is_lost_at_every_reversal_and_only_there() -> None:
+    stage = StageActuator(ActuatorFaults(backlash_m=(2.0, 0.0)))
+    assert travel(stage.obey((1.0, 0.0), 0.0, 5.0), 5.0)[0] == pytest.approx(5.0)
+    # Half of the play, and a stop, which changes nothing; then the other half.
+    assert travel(stage.obey((-1.0, 1.0), 5.0, 6.0), 6.0) == pytest.approx([0.0, 1.0])
+    assert travel(stage.obey((0.0, 0.0), 6.0, 9.0), 9.0) == pytest.approx([0.0, 0.0])
+    assert stage.obey((-1.0, 0.0), 9.0, 12.0) == [(9.0, (0.0, 0.0)), (10.0, (-1.0, 0.0))]
+    assert travel(stage.obey((-1.0, 0.0), 12.0, 13.0), 13.0)[0] == pytest.approx(-1.0)
+    assert travel(stage.obey((1.0, 0.0), 13.0, 16.0), 16.0)[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("faults", [{"gain": (0.0, 1.0)}, {"backlash_m": (-1.0, 0.0)}])
+def test_absurd_faults_are_refused(faults: dict[str, tuple[float, float]]) -> None:
+    with pytest.raises(InvalidValueError):
+        ActuatorFaults(**faults)

@@ -28,7 +28,7 @@ import pytest
 
 import semcal_ros
 from semcal_ros.bridge.diagnostics import join_states
-from semcal_ros.core.camera.ladder_record import LadderRecord
+from semcal_ros.core.camera.records import LadderRecord
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.viewer.measure import format_with_sigma
 from semcal_ros.viewer.plain_words import NodeReport, describe_rates, explain

@@ -24,12 +24,12 @@ import numpy as np
 import pytest
 
 from semcal_ros import Calibration, calibrate
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
 from semcal_ros.config.config import StageConfig, StageSigmas, load_config
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageAxis, StageReading
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
@@ -43,8 +43,7 @@ from semcal_ros.workflows.calibrate import (
     options_for,
 )
 from semcal_ros.workflows.find_grid import collect_views, count_visits, find_views
-from tests.helpers.corner_boards import Board
-from tests.helpers.dot_grids import PatternBoard
+from tests.helpers.grids import Board, PatternBoard
 
 SQUARES = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 PLAN = calibration_plan(

@@ -28,7 +28,7 @@ from semcal_ros import Calibration
 from semcal_ros.core.camera.calibration_model import ScaleSigma
 from semcal_ros.core.errors import BagError
 from semcal_ros.core.registration.affine import NotAlignedError, align_affine
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import Detector, RecordingPlan, preset, truth_of
 from semcal_ros.synthetic.drift import NO_DRIFT
 from semcal_ros.synthetic.plans import PlannedFrame

@@ -30,7 +30,7 @@ from semcal_ros.files.video import VIDEO_SUFFIXES, open_video
 from semcal_ros.workflows import describe_recording as module
 from semcal_ros.workflows.describe_recording import describe_recording
 from semcal_ros.workflows.simulate import simulate
-from tests.files.tiff.test_to_bag import write_tescan
+from tests.files.images.test_to_bag import write_tescan
 
 RNG = np.random.default_rng(3)
 

@@ -28,7 +28,7 @@ import semcal_ros
 from semcal_ros import calibrate, measure_cantilever, reconstruct, rectify, stack, track_drift
 from semcal_ros.bridge.projection import stamped_projection_from_message
 from semcal_ros.config.config import load_config
-from semcal_ros.core.camera.fit_record import FitRecord
+from semcal_ros.core.camera.records import FitRecord
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import open_recording

@@ -22,7 +22,7 @@ from collections.abc import Iterator
 import pytest
 
 from semcal_ros.core.errors import StructureError
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.workflows.reconstruct import reconstruct

@@ -17,16 +17,27 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from semcal_ros import Calibration
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.inputs import resolve_config
-from semcal_ros.workflows.provenance import describe_provenance
+from semcal_ros.workflows.provenance import ConditionsComparison, describe_provenance
+from tests.helpers.calibrations import DEFAULT, calibrated
 
 CONFIG: MicroscopeConfig = resolve_config("generic")
+
+MADE = {
+    "acceleration_voltage_v": (5e3, 5e3),
+    "working_distance_m": (0.01, 0.0101),
+    "detector": ("SE",),
+}
 
 
 def _frame(stamp_ns: int, conditions: Conditions | None = None) -> RecordedFrame:
@@ -70,3 +81,51 @@ def test_what_is_not_known_is_left_empty():
     origin = describe_provenance([], CONFIG, {"frame 0": _frame(5)})
     assert (origin.recording, origin.recording_sha256, origin.recorded) == ("", "", ())
     assert origin.conditions == {}
+
+
+def notes(calibration: Calibration | None, *seen: Conditions | None) -> tuple[str, ...]:
+    comparison = ConditionsComparison(calibration)
+    for own in seen:
+        comparison.add(own)
+    return comparison.notes
+
+
+def test_a_scan_that_turns_on_purpose_is_no_other_condition(calibration: Calibration) -> None:
+    made = replace(calibration.provenance, conditions={**MADE, "scan_rotation_rad": (0.0, 0.0)})
+    unturned = Calibration.from_model(replace(calibration, provenance=made))
+    for may_turn, count in ((False, 1), (True, 0)):
+        comparison = ConditionsComparison(unturned, scans_may_turn=may_turn)
+        comparison.add(Conditions(scan_rotation_rad=1.57))
+        assert len(comparison.notes) == count
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    model = calibrated("jsm820", DEFAULT).model
+    return Calibration.from_model(replace(model, provenance=Provenance(conditions=MADE)))
+
+
+def test_what_changes_the_scale_and_what_does_not_are_told_once_each(
+    calibration: Calibration,
+) -> None:
+    other = Conditions(acceleration_voltage_v=1e4, detector="BSE")
+    decisive, harmless = notes(calibration, other, other, replace(other, working_distance_m=0.0115))
+    assert (
+        "voltage 10 kV, calibrated at 5 kV, working distance 11.5 mm, calibrated at 10 mm to 10.1 mm"
+        in decisive
+    )
+    assert decisive.count("voltage 10 kV") == 1 and "semcal check" in decisive
+    assert harmless == "different from the calibration: detector BSE, calibrated at SE"
+    # A list that nobody reads is cut.
+    (many,) = notes(
+        calibration, *(Conditions(working_distance_m=0.02 + 1e-3 * k) for k in range(9))
+    )
+    assert many.count("calibrated at") == 4 and "and 5 more" in many
+
+
+def test_what_one_of_them_does_not_tell_is_not_compared(calibration: Calibration) -> None:
+    same = Conditions(acceleration_voltage_v=5e3, working_distance_m=0.01005, detector="se")
+    assert notes(calibration, same, None, Conditions()) == ()
+    unknown = Calibration.from_model(replace(calibration, provenance=Provenance()))
+    other = Conditions(acceleration_voltage_v=1e4)
+    assert notes(unknown, other) == notes(None, other) == ()

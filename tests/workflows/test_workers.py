@@ -34,16 +34,16 @@ import tifffile
 import semcal_ros
 from semcal_ros import calibrate, reconstruct, rectify, stack
 from semcal_ros.applications.reconstruction import patches as patches_module
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.files.bags.simulated import write_simulated
+from semcal_ros.files.bags.writer import write_simulated
 from semcal_ros.synthetic import Drift, calibration_plan, drift_plan, preset
 from semcal_ros.workflows import stack as stack_module
 from semcal_ros.workflows import workers as module
 from semcal_ros.workflows.evaluate import evaluate
 from semcal_ros.workflows.find_grid import find_views
 from semcal_ros.workflows.workers import Workers, count_bytes, open_workers
-from tests.helpers.corner_boards import Board
+from tests.helpers.grids import Board
 from tests.helpers.node_scenes import make_calibration
 from tests.helpers.semcal_runs import run
 from tests.helpers.turning_ball import turning_ball

@@ -15,33 +15,38 @@
 """Shape of a specimen from many calibrated views of it: tracks, factorization, adjustment, surface.
 
 After section 4.4 of Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020, with the calibrated
-camera of every view at its own magnification. Only :mod:`.sphere` and :mod:`.ball` assume that the
+camera of every view at its own magnification. Only :mod:`.ball` assumes that the
 specimen is a ball.
 """
 
 from __future__ import annotations
 
 from semcal_ros.applications.reconstruction.adjustment import AdjustedStructure, adjust
-from semcal_ros.applications.reconstruction.ball import Ball, measure_ball
-from semcal_ros.applications.reconstruction.factorization import AffineStructure, factorize
+from semcal_ros.applications.reconstruction.ball import (
+    Ball,
+    Roundness,
+    SphereFit,
+    fit_sphere,
+    measure_ball,
+)
+from semcal_ros.applications.reconstruction.factorization import (
+    AffineStructure,
+    MetricUpgrade,
+    factorize,
+    mirror_structure,
+    upgrade_to_metric,
+)
 from semcal_ros.applications.reconstruction.feature_tracks import (
     SequenceTracker,
     TrackerSettings,
     TrackKeyframe,
-)
-from semcal_ros.applications.reconstruction.mesh import SurfaceMesh, triangulate_cloud
-from semcal_ros.applications.reconstruction.metric_upgrade import (
-    MetricUpgrade,
-    mirror_structure,
-    upgrade_to_metric,
 )
 from semcal_ros.applications.reconstruction.reconstruct import (
     Structure,
     StructureSettings,
     reconstruct,
 )
-from semcal_ros.applications.reconstruction.roundness import Roundness
-from semcal_ros.applications.reconstruction.sphere import SphereFit, fit_sphere
+from semcal_ros.applications.reconstruction.surface import SurfaceMesh, triangulate_cloud
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 
 __all__ = [

@@ -26,16 +26,12 @@ from scipy.spatial.transform import Rotation
 
 from semcal_ros.applications.reconstruction.adjustment import AdjustedStructure, adjust
 from semcal_ros.applications.reconstruction.appearance import compute_log_grey
-from semcal_ros.applications.reconstruction.factorization import factorize
-from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
-from semcal_ros.applications.reconstruction.metric_upgrade import (
+from semcal_ros.applications.reconstruction.factorization import (
+    factorize,
     mirror_structure,
     upgrade_to_metric,
 )
-from semcal_ros.applications.reconstruction.moving_least_squares import (
-    compute_spacing_m,
-    fit_local_surface,
-)
+from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe
 from semcal_ros.applications.reconstruction.patches import (
     PatchSettings,
     PosedSurface,
@@ -43,6 +39,7 @@ from semcal_ros.applications.reconstruction.patches import (
     measure_patches,
     project_to_plane_at_centre,
 )
+from semcal_ros.applications.reconstruction.surface import compute_spacing_m, fit_local_surface
 from semcal_ros.applications.reconstruction.thresholds import POINT_MISFIT_MAX, WINDOW
 from semcal_ros.applications.reconstruction.types import Observations, Tracks
 from semcal_ros.core.arrays import Array, Image, Indices, Mask

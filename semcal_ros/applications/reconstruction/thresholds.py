@@ -146,7 +146,7 @@ POINT_MISFIT_MAX = TABLE.stated(
     "those on the outline of its tip, most above.",
 )
 
-# Spheres, in sphere.py
+# Spheres, in ball.py
 
 SPHERE_TRIALS = TABLE.derived(
     "SPHERE_TRIALS", 500, "samples",
@@ -158,7 +158,7 @@ SPHERE_POINTS_MIN = TABLE.derived(
     "Twice the four unknowns of a sphere.",
 )
 
-# Local surfaces, in moving_least_squares.py
+# Local surfaces, in surface.py
 
 SURFACE_NEIGHBOURS = TABLE.cost(
     "SURFACE_NEIGHBOURS", 48, "points",
@@ -169,7 +169,7 @@ SURFACE_POINTS_MIN = TABLE.derived(
     "A quadric has six coefficients; two more show the scatter.",
 )
 
-# A ball or not, in roundness.py
+# A ball or not, in ball.py
 
 OFF_SPHERE = TABLE.stated(
     "OFF_SPHERE", 0.2, "of the radius",
@@ -217,7 +217,7 @@ PATCH_GROUPS = TABLE.stated(
     "tell a sigma to 18 %.",
 )
 
-# Pairs of tilted pictures, in tilt_pair.py
+# Pairs of tilted pictures, in tilt_series.py
 
 DESCRIPTOR_RATIO = TABLE.derived(
     "DESCRIPTOR_RATIO", 0.8, "ratio",

@@ -14,8 +14,15 @@
 
 """Heights of a specimen from two or three pictures of it at known tilts.
 
+At high magnification an SEM is a parallel projection. A specimen that tilts by ``t`` about an axis in the image
+keeps its coordinate ``u`` along the axis, and the one across becomes ``v' = v cos t + h sin t``, with the height
+``h`` towards the gun. So the normals of the epipolar lines are the axis in both pictures, and the ratio of their
+lengths is that of the magnifications (Hartley and Zisserman, Multiple View Geometry, 2nd ed., chapter 14); the tilt
+does not follow from two pictures.
+
 A pair with the relative tilt ``t`` has the disparity ``d = h tan t`` in the picture of the reference, up to a constant,
 since nobody knows how far the specimen moved. So heights are known up to a constant, and are given about their median.
+
 """
 
 from __future__ import annotations
@@ -23,22 +30,439 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from semcal_ros.applications.reconstruction.epipolar import fit_epipolar
 from semcal_ros.applications.reconstruction.thresholds import (
     AXIS_DOUBT_RAD,
     CONTRADICTION_SIGMAS,
     COVERAGE_MIN,
+    DESCRIPTOR_RATIO,
+    DISPARITY_AGREEMENT_PX,
+    GREY_CORRELATION_MIN,
+    GREY_WINDOW_PX,
+    KEPT_NOISE,
+    MATCH_NEIGHBOURS,
+    MATCH_STEPS,
+    MATCH_TOLERANCE_PX,
+    MATCHES_MIN,
+    MATCHES_PART_MIN,
+    NEIGHBOUR_SIGMAS,
+    NOISE_GAIN,
+    OVERLAP_MATCHES,
+    OVERLAP_MIN,
+    PARALLAX_MAX,
+    PARALLAX_MIN,
     TILT_STEP_MAX_RAD,
     TILT_STEP_MIN_RAD,
 )
-from semcal_ros.applications.reconstruction.tilt_pair import (
-    TiltGeometry,
-    find_tilt_geometry,
-    match_densely,
-)
-from semcal_ros.core.arrays import AnyImage, Array, check_positive, mad_sigma
+from semcal_ros.core.arrays import AnyImage, Array, Image, Mask, check_positive, mad_sigma
 from semcal_ros.core.errors import InvalidValueError, StructureError
+from semcal_ros.core.wording import counted
+
+
+@dataclass(frozen=True, eq=False)
+class TiltGeometry:
+    """Affine epipolar geometry of two pictures that differ by a tilt.
+
+    Attributes
+    ----------
+    axis_rad, second_axis_rad
+        Direction of the tilt axis in the first and the second picture, from +x towards +y.
+    scale
+        Magnification of the second picture over that of the first.
+    covariance
+        (3, 3) of these three.
+    first, second
+        (n, 2) verified matches, px.
+    matches
+        Number of matches before the geometry was verified.
+    rms_px
+        RMS distance of the verified matches from the epipolar geometry.
+    """
+
+    axis_rad: float
+    second_axis_rad: float
+    scale: float
+    covariance: Array
+    first: Array
+    second: Array
+    matches: int
+    rms_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class Disparity:
+    """Disparity of two rectified pictures, on the grid of the first picture.
+
+    Attributes
+    ----------
+    value_px
+        (h, w) shift across the axis in px of the first picture; NaN where there is no match.
+    sigma_px
+        (h, w) its 1-sigma from the noise of the matching.
+    """
+
+    value_px: Array
+    sigma_px: Array
+
+
+def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: float) -> TiltGeometry:
+    """Match SIFT features both ways and fit the affine epipolar geometry that they agree on.
+
+    Parameters
+    ----------
+    first, second
+        (h, w) grey levels.
+    near_axis_rad
+        Of the two senses of the axis, the one within 90 degrees of this is meant.
+
+    Raises
+    ------
+    StructureError
+        If too few matches agree, they show no parallax, or the pictures have too little in common.
+    """
+    one, two = _match_features(first, second)
+    if OVERLAP_MATCHES <= len(one) < MATCHES_MIN:
+        _check_overlap(one, two, first, second)
+    if len(one) < MATCHES_MIN:
+        raise _refuse_matches(f"only {counted(len(one), 'match', 'matches')}")
+    centre, second_centre = _centre_of(first), _centre_of(second)
+    found = fit_epipolar(one - centre, two - second_centre, MATCH_TOLERANCE_PX, trials=2000)
+    kept = found.inliers.copy()
+    kept[kept] = _agree_with_neighbours(one[kept], two[kept])
+    if np.count_nonzero(kept) >= MATCHES_PART_MIN * len(one):
+        _check_overlap(one[kept], two[kept], first, second)
+    count = int(np.count_nonzero(kept))
+    if count < max(MATCHES_MIN, MATCHES_PART_MIN * len(one)):
+        raise _refuse_matches(
+            f"only {count} of {counted(len(one), 'match', 'matches')} agree with a tilt"
+        )
+    one, two, matches = one[kept], two[kept], len(one)
+    joint = np.hstack([two - second_centre, one - centre])
+    values, vectors = np.linalg.eigh(np.cov(joint.T) * (count - 1))
+    # Of one picture twice, rounding makes them zero or less.
+    values = np.maximum(values, 1e-12 * values[-1])
+    noise = values[0] / (count - 4)
+    if np.sqrt(values[1] / values[0]) < PARALLAX_MIN:
+        raise StructureError(
+            f"the pictures show no parallax: {count} matches fit a flat specimen within "
+            f"{np.sqrt(values[1] / count):.2f} px",
+            expected="a specimen with relief, tilted between the pictures",
+            do="tilt further, or record at a higher magnification",
+        )
+    normal = vectors[:, 0]
+    # First-order perturbation of an eigenvector; the noise is part of the larger eigenvalues, too.
+    spread = values[1:] / (values[1:] - values[0]) ** 2
+    covariance = noise * (vectors[:, 1:] * spread) @ vectors[:, 1:].T
+    parameters = _describe_normal(normal, near_axis_rad)
+    if not 0.5 < parameters[2] < 2.0:
+        raise StructureError(
+            f"the pictures differ in magnification by a factor of {parameters[2]:.2f} along the axis",
+            expected="pictures of one magnification",
+        )
+    step = 1e-6
+    jacobian = np.stack(
+        [
+            (
+                _describe_normal(normal + step * unit, parameters[0])
+                - _describe_normal(normal - step * unit, parameters[0])
+            )
+            / (2.0 * step)
+            for unit in np.eye(4)
+        ],
+        axis=1,
+    )
+    axis, second_axis, scale = (float(value) for value in parameters)
+    return TiltGeometry(
+        axis,
+        second_axis,
+        scale,
+        jacobian @ covariance @ jacobian.T,
+        one,
+        two,
+        matches,
+        float(np.sqrt(noise)),
+    )
+
+
+def match_densely(
+    first: AnyImage, second: AnyImage, geometry: TiltGeometry, tilt_rad: float
+) -> Disparity:
+    """Find the disparity ``v' / (scale cos t) - v`` of every pixel: semi-global search, then least squares.
+
+    Both pictures are turned so that rows are epipolar lines, and the second is stretched by 1 / cos t, so that a flat
+    specimen has a constant disparity.
+
+    Parameters
+    ----------
+    first, second
+        (h, w) grey levels.
+    geometry
+        Of the two.
+    tilt_rad
+        Tilt of the second picture against the first.
+    """
+    width = int(np.ceil(np.hypot(*first.shape[:2])))
+    middle = 0.5 * (width - 1)
+    stretch = geometry.scale * np.cos(tilt_rad)
+    ours = _rows_along(geometry.axis_rad, 1.0, 1.0)
+    theirs = _rows_along(geometry.second_axis_rad, geometry.scale, stretch)
+    across = (geometry.second - _centre_of(second)) @ np.linalg.inv(theirs).T
+    here = (geometry.first - _centre_of(first)) @ np.linalg.inv(ours).T
+    # What the verified matches share is taken out, in both directions, so that the search is short.
+    shift = np.median(across - here, axis=0)
+    parallax = (across - here)[:, 0] - shift[0]
+    reach = 1.5 * float(np.max(np.abs(np.percentile(parallax, (0.5, 99.5))))) + 8.0
+    left, left_seen = _resample(first, ours, middle, (0.0, 0.0))
+    right, right_seen = _resample(second, theirs, middle, shift)
+    disparity, valid = _search(left, right, left_seen, right_seen, int(np.ceil(reach / 8.0)) * 8)
+    refined, sigma = _refine(left, right, disparity, valid & left_seen, right_seen)
+    refined = refined + shift[0]
+    back = cv2.invertAffineTransform(_affine(ours, _centre_of(first), middle, (0.0, 0.0)))
+    height, columns = first.shape[:2]
+    value, spread = (
+        cv2.warpAffine(
+            part.astype(np.float32),
+            back,
+            (columns, height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderValue=float("nan"),
+        ).astype(np.float64)
+        for part in (refined, sigma)
+    )
+    return Disparity(value, spread)
+
+
+def _centre_of(image: AnyImage) -> Array:
+    return 0.5 * (np.array(image.shape[1::-1], dtype=np.float64) - 1.0)
+
+
+def _refuse_matches(seen: str) -> StructureError:
+    return StructureError(
+        f"{seen} between two pictures",
+        expected=f"at least {MATCHES_MIN} that agree, from pictures that overlap and look alike",
+        do="tilt by less between pictures, keep detector and contrast, and avoid charging",
+    )
+
+
+def _to_bytes(image: AnyImage) -> NDArray[np.uint8]:
+    grey = image.astype(np.float32)
+    low, high = np.percentile(grey, (0.1, 99.9))
+    scaled = (grey - low) * (255.0 / max(high - low, 1e-12))
+    return np.clip(scaled, 0, 255).astype(np.uint8)
+
+
+def _match_features(first: AnyImage, second: AnyImage) -> tuple[Array, Array]:
+    """Match features of two images, each the best for the other; a place that has two orientations counts once."""
+    finder = cv2.SIFT.create(nfeatures=8000)
+    points, described = finder.detectAndCompute(_to_bytes(first), None)
+    others, other_described = finder.detectAndCompute(_to_bytes(second), None)
+    if min(len(points), len(others)) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    forward = matcher.knnMatch(described, other_described, k=2)
+    back = {m.queryIdx: m.trainIdx for m in matcher.match(other_described, described)}
+    good = [
+        m
+        for m, rival in forward
+        if m.distance < DESCRIPTOR_RATIO * rival.distance and back[m.trainIdx] == m.queryIdx
+    ]
+    pairs = np.array([[*points[m.queryIdx].pt, *others[m.trainIdx].pt] for m in good])
+    pairs = np.unique(pairs.reshape(-1, 4), axis=0)
+    return pairs[:, :2], pairs[:, 2:]
+
+
+def _agree_with_neighbours(first: Array, second: Array) -> Mask:
+    """Which matches are shifted as those around them in the first picture.
+
+    A wrong match that happens to lie on its epipolar line passes every test of the epipolar geometry. One of them,
+    shifted by a hundred px where relief shifts by one, outweighs a thousand right ones in the direction of the axis.
+    """
+    if len(first) <= MATCH_NEIGHBOURS:
+        return np.ones(len(first), dtype=np.bool_)
+    shifts = second - first
+    around = cKDTree(first).query(first, MATCH_NEIGHBOURS + 1)[1][:, 1:]
+    apart = shifts - np.median(shifts[around], axis=1)
+    spread = max(mad_sigma(apart[:, 0]), mad_sigma(apart[:, 1]))
+    limit = max(MATCH_TOLERANCE_PX, NEIGHBOUR_SIGMAS * spread)
+    return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) < limit)
+
+
+def _check_overlap(first: Array, second: Array, image: AnyImage, other: AnyImage) -> None:
+    """Refuse pictures of which the matches, if an affine map describes them, have too little in common."""
+    design = np.column_stack([first, np.ones(len(first))])
+    matrix, _, rank, _ = np.linalg.lstsq(design, second, rcond=None)
+    residual = second - design @ matrix
+    extent = np.array(image.shape[1::-1], dtype=np.float64)
+    # Wrong matches, or too few places for an affine map, tell no overlap.
+    if rank < 3 or np.max(np.std(residual, axis=0) / extent) > PARALLAX_MAX:
+        return
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    seen = np.column_stack([unit * extent, np.ones(4)]) @ matrix
+    frame = unit * np.array(other.shape[1::-1], dtype=np.float64)
+    area = cv2.intersectConvexConvex(seen.astype(np.float32), frame.astype(np.float32))[0]
+    share = float(area) / abs(float(np.linalg.det(matrix[:2]))) / float(np.prod(extent))
+    if share < OVERLAP_MIN:
+        x, y = seen.mean(axis=0) - frame.mean(axis=0)
+        raise StructureError(
+            f"the pictures share {share:.0%} of their field: the second is shifted by {x:+.0f}, {y:+.0f} px",
+            expected=f"at least {OVERLAP_MIN:.0%} in common",
+            do="bring the same place back to the middle after tilting, or record at a lower magnification",
+        )
+
+
+def _describe_normal(normal: Array, near_axis_rad: float) -> Array:
+    """Axis in both pictures and scale, from the plane ``a x' + b y' + c x + d y + e = 0``."""
+    a, b, c, d = normal
+    axis, second = np.arctan2(-d, -c), np.arctan2(b, a)
+    if np.cos(axis - near_axis_rad) < 0.0:
+        axis, second = axis + np.pi, second + np.pi
+    axis = near_axis_rad + np.angle(np.exp(1j * (axis - near_axis_rad)))
+    second = axis + np.angle(np.exp(1j * (second - axis)))
+    return np.array([axis, second, np.hypot(c, d) / np.hypot(a, b)])
+
+
+def _rows_along(axis_rad: float, along: float, across: float) -> Array:
+    """(2, 2) matrix from (column v, row u) of a rectified picture to (x, y)."""
+    c, s = np.cos(axis_rad), np.sin(axis_rad)
+    return np.array([[-s * across, c * along], [c * across, s * along]])
+
+
+def _affine(
+    matrix: Array, centre: Array, middle: float, shift: Array | tuple[float, float]
+) -> Array:
+    offset = centre + matrix @ (np.asarray(shift) - middle)
+    return np.hstack([matrix, offset[:, None]])
+
+
+def _resample(
+    image: AnyImage, matrix: Array, middle: float, shift: Array | tuple[float, float]
+) -> tuple[Image, Mask]:
+    size = round(2 * middle + 1)
+    warp = _affine(matrix, _centre_of(image), middle, shift)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    out = cv2.warpAffine(
+        image.astype(np.float32), warp, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    inside = np.ones(image.shape[:2], np.uint8)
+    seen = cv2.warpAffine(
+        inside, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    )
+    return np.asarray(out, dtype=np.float32), seen > 0
+
+
+def _blur(image: Array | Image) -> Image:
+    return np.asarray(
+        cv2.GaussianBlur(np.asarray(image, dtype=np.float32), (0, 0), GREY_WINDOW_PX),
+        dtype=np.float32,
+    )
+
+
+def _flatten(image: Image) -> NDArray[np.uint8]:
+    """Local mean and contrast divided out, as bytes: what the search compares."""
+    centred = image - cv2.GaussianBlur(image, (0, 0), 8.0)
+    contrast = np.sqrt(cv2.GaussianBlur(centred**2, (0, 0), 8.0)) + 1e-6
+    return np.clip(128.0 + 42.0 * centred / contrast, 0, 255).astype(np.uint8)
+
+
+def _search(
+    left: Image, right: Image, left_seen: Mask, right_seen: Mask, reach: int
+) -> tuple[Array, Mask]:
+    """Disparity to a px, with the search from the other side as a check."""
+    count = max(16, -(-2 * reach // 16) * 16)
+    block = 5
+    one, two = _flatten(left), _flatten(right)
+
+    def search(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Array:
+        pad = count
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=-count // 2,
+            numDisparities=count,
+            blockSize=block,
+            # The penalties that OpenCV's documentation gives for one channel.
+            P1=8 * block * block,
+            P2=32 * block * block,
+            uniquenessRatio=5,
+            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )
+        wide = [cv2.copyMakeBorder(i, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for i in (a, b)]
+        found = matcher.compute(*wide)[:, pad:-pad].astype(np.float64) / 16.0
+        # OpenCV's disparity counts to the left.
+        return np.where(found < -count // 2, np.nan, -found)
+
+    forward, back = search(one, two), search(two, one)
+    rows, columns = np.indices(forward.shape)
+    target = columns + np.nan_to_num(np.round(forward)).astype(int)
+    inside = (target >= 0) & (target < forward.shape[1]) & np.isfinite(forward)
+    target = np.clip(target, 0, forward.shape[1] - 1)
+    agrees = np.abs(forward + back[rows, target]) <= DISPARITY_AGREEMENT_PX
+    valid = inside & agrees & left_seen & right_seen[rows, target]
+    return forward, valid
+
+
+def _refine(
+    left: Image, right: Image, start: Array, valid: Mask, right_seen: Mask
+) -> tuple[Array, Array]:
+    """Fit the disparity by least squares of grey levels in a window, free in brightness and contrast."""
+    weight = _blur(valid.astype(np.float32))
+    disparity = np.where(
+        weight > 0.3, _blur(np.where(valid, start, 0.0)) / np.maximum(weight, 1e-6), np.nan
+    )
+    known = np.isfinite(disparity)
+    disparity = np.where(known, disparity, 0.0)
+    grid = np.indices(left.shape).astype(np.float32)
+    rows, columns = grid[0], grid[1]
+    mean = _blur(left)
+    centred = left - mean
+    variance = _blur(centred**2)
+
+    def compare() -> tuple[Image, Image]:
+        at = (columns + disparity).astype(np.float32)
+        warped: Image = np.asarray(
+            cv2.remap(right, at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE),
+            dtype=np.float32,
+        )
+        other = warped - _blur(warped)
+        gain = _blur(centred * other) / np.maximum(_blur(other**2), 1e-6)
+        slope = gain * (
+            0.5 * np.diff(warped, axis=1, prepend=warped[:, :1])
+            + 0.5 * np.diff(warped, axis=1, append=warped[:, -1:])
+        )
+        return np.asarray(centred - gain * other, np.float32), np.asarray(slope, np.float32)
+
+    for _ in range(MATCH_STEPS):
+        residual, slope = compare()
+        change = _blur(slope * residual) / np.maximum(_blur(slope**2), 1e-6)
+        disparity = disparity + np.clip(change, -1.0, 1.0)
+    residual, slope = compare()
+    # Two free values of brightness and contrast, and the shift, over the 4 pi sigma^2 px of the window.
+    cells = 4.0 * np.pi * GREY_WINDOW_PX**2
+    noise = _blur(residual**2) * (cells / (cells - 3.0)) / KEPT_NOISE
+    information = _blur(slope**2)
+    narrow = cv2.GaussianBlur(slope**2, (0, 0), GREY_WINDOW_PX / np.sqrt(2.0))
+    # sum w^2 g^2 / (sum w g^2)^2, where w^2 is a Gaussian narrower by sqrt(2) and lower by the size of the window.
+    sigma = np.sqrt(NOISE_GAIN * noise * narrow / cells) / np.maximum(information, 1e-12)
+    rough = disparity.copy()
+    for _ in range(MATCH_STEPS):
+        rough = rough - _blur(rough)
+    # What the steps have not given back yet, as far as it shows.
+    sigma = np.sqrt(sigma**2 + _blur(rough**2))
+    correlation = np.sqrt(np.clip(1.0 - _blur(residual**2) / np.maximum(variance, 1e-12), 0.0, 1.0))
+    target = np.clip(np.round(columns + disparity).astype(int), 0, left.shape[1] - 1)
+    good = (
+        valid
+        & known
+        & (correlation > GREY_CORRELATION_MIN)
+        & right_seen[rows.astype(int), target]
+        # A step of more than this was beyond the reach of the least squares.
+        & (np.abs(disparity - start) < 2.0)
+        & (sigma < DISPARITY_AGREEMENT_PX)
+    )
+    return np.where(good, disparity, np.nan), np.where(good, sigma, np.nan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,19 +16,20 @@
 
 from __future__ import annotations
 
-from semcal_ros.applications.servoing.axis import AxisObserver
-from semcal_ros.applications.servoing.detection import TargetView, find_target
-from semcal_ros.applications.servoing.law import Servo, ServoStatus, ServoStep
+from semcal_ros.applications.servoing.law import Servo, ServoSettings, ServoStatus, ServoStep
 from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
-from semcal_ros.applications.servoing.plane_camera import PlaneCamera, choose_projection
+from semcal_ros.applications.servoing.plane_camera import (
+    AxisObserver,
+    PlaneCamera,
+    choose_projection,
+)
 from semcal_ros.applications.servoing.pose import (
     PlanePose,
     PoseFit,
     compute_interaction_matrix,
     fit_pose,
 )
-from semcal_ros.applications.servoing.settings import ServoSettings
-from semcal_ros.applications.servoing.target import NestedTarget
+from semcal_ros.applications.servoing.target import NestedTarget, TargetView, find_target
 
 __all__ = [
     "AxisObserver",

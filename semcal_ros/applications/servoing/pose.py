@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semcal_ros.applications.servoing.detection import TargetView
 from semcal_ros.applications.servoing.plane_camera import PlaneCamera
+from semcal_ros.applications.servoing.target import TargetView
 from semcal_ros.applications.servoing.thresholds import (
     MISREAD_PART,
     POSE_SETTLED_PX,

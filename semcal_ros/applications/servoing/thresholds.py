@@ -42,7 +42,7 @@ LEVELS_MAX = TABLE.derived(
     "Eight markers in each: the fifty of the dictionary are enough for six.",
 )
 
-# Detection of markers, in detection.py
+# Detection of markers, in target.py
 
 SEARCHED_PX = TABLE.cost(
     "SEARCHED_PX", 1024, "px",
@@ -125,7 +125,7 @@ SAME_MATRIX = TABLE.derived(
     "1e-15, and single precision would be 1e-7.",
 )
 
-# The axis of the zoom, in axis.py
+# The axis of the zoom, in plane_camera.py
 
 SAME_SCALE = TABLE.stated(
     "SAME_SCALE", 0.002, "of the scale",

@@ -47,7 +47,7 @@ from semcal_ros.core.camera.calibration_model import (
     ScaleSigma,
     pixel_size_gradient,
 )
-from semcal_ros.core.camera.fit_record import FitRecord, ScaleShares
+from semcal_ros.core.camera.records import FitRecord, ScaleShares
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError

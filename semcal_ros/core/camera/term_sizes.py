@@ -24,11 +24,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.distortion import distort_normalised
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.camera.scan_distortion import (
-    SCAN_NAMES,
-    SETTLING,
-    deflection_shift,
-)
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, SETTLING, deflection_shift
 from semcal_ros.core.camera.thresholds import TERM_SIZES_ACROSS
 
 TERM_KINDS: tuple[str, ...] = (

@@ -62,7 +62,7 @@ LENS_TOLERANCE = TABLE.derived(
     "Of the last step: some ninety roundings of a coordinate of order one, 2^-53.",
 )
 
-# Nominal calibrations, in nominal_calibration.py
+# Nominal calibrations, in calibration_model.py
 
 CONTRADICTION_SIGMAS = TABLE.derived(
     "CONTRADICTION_SIGMAS", 3.0, "sigma",
@@ -89,7 +89,7 @@ COMPARED_HEIGHTS = TABLE.stated(
     "and the heights at which they are.",
 )
 
-# The raw picture as a pinhole's, in plumb_bob.py
+# The raw picture as a pinhole's, in pinhole_model.py
 
 PLUMB_BOB_POINTS = TABLE.derived(
     "PLUMB_BOB_POINTS", 10, "points",
@@ -168,7 +168,7 @@ TERM_SIZES_ACROSS = TABLE.stated(
     "Of the lattice along each side of the picture, its outermost pixels among them.",
 )
 
-# The budget, in uncertainty_budget.py
+# The budget, in uncertainty.py
 
 SPECIMEN_TILT_SIGMA_RAD = TABLE.stated(
     "SPECIMEN_TILT_SIGMA_RAD", 0.0087, "rad",

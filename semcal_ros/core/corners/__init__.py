@@ -17,8 +17,8 @@
 from __future__ import annotations
 
 from semcal_ros.core.corners.detection import LatticeDetection, find_lattice
+from semcal_ros.core.corners.lattice import LatticeStatus
 from semcal_ros.core.corners.pattern import PATTERN_NAMES, PATTERNS, check_pattern, describe_odds
-from semcal_ros.core.corners.saddle import LatticeStatus
 
 __all__ = [
     "PATTERNS",

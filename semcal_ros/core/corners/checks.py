@@ -23,6 +23,7 @@ from scipy import ndimage
 
 from semcal_ros.core.arrays import MEDIAN_CHI2, MEDIAN_CHI2_2, Array, Array32, Indices, Mask
 from semcal_ros.core.corners.corner_fit import CornerFit, PositionFit
+from semcal_ros.core.corners.edge_model import PixelWindows
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.thresholds import (
     ANGLE_MAX,
@@ -51,7 +52,6 @@ from semcal_ros.core.corners.thresholds import (
     TREND_DEGREE,
     UNLIKE_MAX,
 )
-from semcal_ros.core.corners.window import PixelWindows
 
 # By the number of dimensions.
 MEDIAN_SIGMA = {1: MEDIAN_SIGMA_1, 2: MEDIAN_SIGMA_2}

@@ -29,8 +29,13 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices, Mask
 from semcal_ros.core.corners.lattice import Lattice, enlarged
-from semcal_ros.core.corners.local_phase import follow_phase
-from semcal_ros.core.corners.spectrum import Spectrum, clip_levels, compute_spectrum, list_octaves
+from semcal_ros.core.corners.spectrum import (
+    Spectrum,
+    clip_levels,
+    compute_spectrum,
+    follow_phase,
+    list_octaves,
+)
 from semcal_ros.core.corners.thresholds import (
     BASES_TRIED,
     BASIS_PARTS,

@@ -43,7 +43,13 @@ from semcal_ros.core.corners.dots_and_lines import (
     split_mixture,
 )
 from semcal_ros.core.corners.grating import find_lines, fit_lines
-from semcal_ros.core.corners.lattice import Lattice, enlarged
+from semcal_ros.core.corners.lattice import (
+    Lattice,
+    LatticeStatus,
+    enlarged,
+    prepare_image,
+    screen_image,
+)
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners, refine_lattice
 from semcal_ros.core.corners.local_map import fit_local_maps
 from semcal_ros.core.corners.pattern import (
@@ -55,7 +61,6 @@ from semcal_ros.core.corners.pattern import (
     check_pattern,
     describe_odds,
 )
-from semcal_ros.core.corners.saddle import LatticeStatus, prepare_image, screen_image
 from semcal_ros.core.corners.thresholds import (
     ALONG_SIGMA,
     CELL_ASYMMETRY_MAX,

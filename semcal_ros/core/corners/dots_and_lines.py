@@ -30,11 +30,18 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Array32, Image, Indices, Mask
 from semcal_ros.core.corners.checks import find_consistent, inflate_variance, select_connected
 from semcal_ros.core.corners.corner_fit import NoiseModel, fit_noise
-from semcal_ros.core.corners.lattice import STEPS, Lattice, enlarged, grow_best_lattice
+from semcal_ros.core.corners.edge_model import PixelWindows
+from semcal_ros.core.corners.lattice import (
+    STEPS,
+    Lattice,
+    SaddlePoints,
+    enlarged,
+    find_saddles,
+    grow_best_lattice,
+)
 from semcal_ros.core.corners.lattice_refinement import RefinedCorners
 from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.pattern import CellShape, CellShapes, find_motif, fit_shapes
-from semcal_ros.core.corners.saddle import SaddlePoints, find_saddles
 from semcal_ros.core.corners.thresholds import (
     CELL_SAMPLE,
     CELL_SAMPLE_MIN,
@@ -63,7 +70,6 @@ from semcal_ros.core.corners.unit_cell import (
     fit_cells,
     gather_cells,
 )
-from semcal_ros.core.corners.window import PixelWindows
 
 
 def grow_at_scale(

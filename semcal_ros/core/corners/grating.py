@@ -26,10 +26,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices, Mask
-from semcal_ros.core.corners.lattice import Lattice, enlarged
-from semcal_ros.core.corners.local_phase import follow_phase
-from semcal_ros.core.corners.saddle import LatticeStatus
-from semcal_ros.core.corners.spectrum import clip_levels, compute_spectrum, list_octaves
+from semcal_ros.core.corners.lattice import Lattice, LatticeStatus, enlarged
+from semcal_ros.core.corners.spectrum import (
+    clip_levels,
+    compute_spectrum,
+    follow_phase,
+    list_octaves,
+)
 from semcal_ros.core.corners.thresholds import (
     ACROSS_POWER_MAX,
     LINES_DEGREE,

@@ -31,21 +31,19 @@ from semcal_ros.core.corners.checks import (
     select_connected,
 )
 from semcal_ros.core.corners.corner_fit import (
+    Learnt,
     NoiseModel,
     band_px,
     fit_corners,
     fit_noise,
-    rough_start,
-)
-from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry
-from semcal_ros.core.corners.lattice import STEPS, Lattice
-from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
-from semcal_ros.core.corners.priors import (
-    Learnt,
     learn,
     loose_prior,
+    rough_start,
     smooth_levels,
 )
+from semcal_ros.core.corners.edge_model import LOG_BLUR, EdgeGeometry, gather_windows
+from semcal_ros.core.corners.lattice import STEPS, Lattice
+from semcal_ros.core.corners.local_map import LocalMaps, fit_local_maps
 from semcal_ros.core.corners.thresholds import (
     ASSUMED_VARIANCE,
     CORNER_SAMPLE,
@@ -57,7 +55,6 @@ from semcal_ros.core.corners.thresholds import (
     MARGIN_PX,
     RIM_PART,
 )
-from semcal_ros.core.corners.window import gather_windows
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ TABLE = Table()
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
-# Saddle points, in saddle.py
+# Saddle points, in lattice.py
 
 SADDLE_THRESHOLD = TABLE.derived(
     "SADDLE_THRESHOLD", 0.1, "of the strong response",
@@ -114,7 +114,7 @@ SUPPORT_MIN = TABLE.derived(
     "Three points determine an affine map.",
 )
 
-# Windows of corners, in window.py
+# Windows of corners, in edge_model.py
 
 WINDOW_HALF_WIDTH = TABLE.derived(
     "WINDOW_HALF_WIDTH", 0.5, "squares",
@@ -143,7 +143,7 @@ ERF_C = TABLE.derived(
     "c1 to c5 of the same.",
 )
 
-# Priors of the fit of corners, in priors.py
+# Priors of the fit of corners, in corner_fit.py
 
 ANGLE_PRIOR = TABLE.derived(
     "ANGLE_PRIOR", 0.03, "rad",
@@ -546,7 +546,7 @@ LAST_STEP_MAX_PX = TABLE.stated(
     "Of a fit that has converged, besides a hundredth of the spacing.",
 )
 
-# Local phases, in local_phase.py
+# Local phases, in spectrum.py
 
 DEMODULATION_PERIODS = TABLE.derived(
     "DEMODULATION_PERIODS", 0.75, "periods",

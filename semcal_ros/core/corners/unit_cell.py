@@ -38,6 +38,7 @@ from semcal_ros.core.corners.corner_fit import (
     normal_equations,
     split_statistics,
 )
+from semcal_ros.core.corners.edge_model import PixelWindows, gather_windows
 from semcal_ros.core.corners.local_map import LocalMaps
 from semcal_ros.core.corners.thresholds import (
     CELL_BLOCK_PIXELS,
@@ -52,7 +53,6 @@ from semcal_ros.core.corners.thresholds import (
     NOISE_POWERS,
     SAMPLES_PER_KNOT,
 )
-from semcal_ros.core.corners.window import PixelWindows, gather_windows
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.camera.calibration_model import CalibrationModel, columns_of
-from semcal_ros.core.camera.ladder_record import LadderRecord, Relay
+from semcal_ros.core.camera.records import LadderRecord, Relay
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.adjustment import LadderFit, adjust

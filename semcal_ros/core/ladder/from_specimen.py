@@ -31,7 +31,7 @@ from semcal_ros.core.arrays import Array, check_positive, check_range
 from semcal_ros.core.calibration.stage import fit_stage_moves
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, columns_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.ladder_record import LadderRecord
+from semcal_ros.core.camera.records import LadderRecord
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.extend import (

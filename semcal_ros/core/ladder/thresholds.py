@@ -27,7 +27,7 @@ TABLE = Table()
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
-# Plans, in plan.py
+# Plans, in acquisition.py
 
 LADDER_MOVES = TABLE.stated(
     "LADDER_MOVES", ((0.0, 0.0), (0.25, 0.08), (-0.07, 0.26)), "fields of view",

@@ -143,7 +143,7 @@ OUTSIDE_PX = TABLE.defined(
     "A raw position outside every frame, for output pixels without one: they come out as 0.",
 )
 
-# The inverse of a residual field, in field_table.py
+# The inverse of a residual field, in chebyshev_map.py
 
 FIELD_COLUMN_PX = TABLE.stated(
     "FIELD_COLUMN_PX", 0.5, "px",

@@ -12,21 +12,51 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a topic of a recording said last before a given moment, such as the magnification of an image."""
+"""What the other topics of a recording said when an image was taken: its magnification, the stage, the conditions.
+
+A recording can always be calibrated without its stage. So nothing that is wrong with it is an error:
+it is left out, in whole or in part, with a note that says why. Conditions are never an error either: what cannot be
+read is not known.
+
+"""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
+from dataclasses import fields
+from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
-from semcal_ros.bridge.headers import optional_stamp_ns
+from semcal_ros.bridge.conditions import (
+    CONDITIONS_TYPE,
+    NUMBERS,
+    TEXTS,
+    Conditions,
+    read_conditions,
+)
+from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
-from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
-from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.bridge.stage import doubt_unit, missing_joints, read_stage, tilt_jump_rad
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
+from semcal_ros.config.config import MicroscopeConfig, StageConfig
+from semcal_ros.core.calibration.stage import StageReading
+from semcal_ros.core.camera.conditions import FILE_NAMES
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.files.bags.reader import BagReader, RawMessage
+from semcal_ros.core.wording import counted
+from semcal_ros.files.bags.reader import BagReader, BagTopic, RawMessage, topic_matches
 
 T = TypeVar("T")
+
+_UNUSED = "the stage is not used"
+
+CONDITIONS_TOPIC = "conditions"
+"""Topic with what the microscope says of the conditions (diagnostic_msgs/DiagnosticStatus)."""
+
+_METADATA_TOPIC, _METADATA_TYPE = "metadata", "std_msgs/msg/String"
+# What an import writes of one image has a few hundred characters.
+_LONGEST_TEXT = 100_000
 
 
 class HeldValues(Generic[T]):
@@ -110,3 +140,219 @@ class MagnificationTrack(HeldValues[MagnificationReading]):
         """
         reading = self.held_at(stamp_ns, log_time_ns)
         return None if reading is None else float(reading.magnification(image_width_px))
+
+
+class StageTrack(HeldValues[StageReading]):
+    """All messages of the stage, each valid until the next one."""
+
+    def __init__(self, reader: BagReader, topic: str, config: MicroscopeConfig) -> None:
+        self._config = config
+        source = config.stage or StageConfig()
+        super().__init__(reader, topic, lambda message: read_stage(message, source))
+        self._source = source
+        self._topic = topic
+        self._readings = [reading for _, reading in self.timed if reading is not None]
+
+    def at(self, stamp_ns: int, log_time_ns: int) -> tuple[StageReading | None, bool]:
+        """Return the reading at an image, None if it is not known; and whether the stage moved."""
+        reading = self.held_at(stamp_ns, log_time_ns)
+        interval = scan_interval_ns(stamp_ns, None if self.by_stamp else log_time_ns, self._config)
+        if reading is None or interval is None:
+            return reading, False
+        others = [other for other in self.held_during(*interval) if other is not None]
+        moved = any(self._differs(reading, other) for other in others)
+        return (None if moved else reading), moved
+
+    def _differs(self, one: StageReading, other: StageReading) -> bool:
+        sigma = self._source.sigma
+        angles = (
+            (one.tilt_rad, other.tilt_rad, sigma.tilt),
+            (one.rotation_rad, other.rotation_rad, sigma.rotation),
+            (one.scan_rotation_rad, other.scan_rotation_rad, sigma.rotation),
+        )
+        return any(a is not None and b is not None and abs(a - b) > s for a, b, s in angles)
+
+    def problem(self) -> str:
+        """Return why no reading can be used; empty if they can."""
+        if not self._readings:
+            return f"no message of {len(self.bad)} is usable, the first: {self.bad[0]}"
+        for reading in self._readings:
+            if doubt := doubt_unit(reading, self._source):
+                return f"{doubt} looks like degrees; expected radians"
+        return ""
+
+    def notes(self) -> list[str]:
+        """Return what is odd about the readings although they are used."""
+        notes = []
+        if self.bad:
+            notes.append(
+                f"{counted(len(self.bad), 'message')} on {self._topic} ignored"
+                + (", the first" if len(self.bad) > 1 else "")
+                + f": {self.bad[0]}"
+            )
+        notes += [
+            f"no message on {self._topic} has the joint {joint}"
+            for joint in missing_joints(self._readings, self._source)
+        ]
+        for joint, name in (
+            (self._source.tilt, "tilt_rad"),
+            (self._source.rotation, "rotation_rad"),
+            (self._source.scan_rotation, "scan_rotation_rad"),
+        ):
+            without = sum(getattr(reading, name) is None for reading in self._readings)
+            if 0 < without < len(self._readings):
+                notes.append(
+                    f"{without} of {counted(len(self._readings), 'message')} on {self._topic} without the joint {joint}"
+                )
+        jumps = list(self._jumps())
+        if jumps:
+            degrees, seconds, at_ns = jumps[0]
+            notes.append(
+                f"the tilt on {self._topic} jumps {len(jumps)} times, first by {degrees:.1f} degrees within "
+                f"{seconds:.3g} s at {at_ns * 1e-9:.3f} s: a wrong reading, or a wrong stamp"
+            )
+        return notes
+
+    def _jumps(self) -> list[tuple[float, float, int]]:
+        """(degrees, seconds, time in ns) of each change of the tilt that no stage can make."""
+        tilts = [
+            (time_ns, reading)
+            for time_ns, reading in self.timed
+            if reading is not None and reading.tilt_rad is not None
+        ]
+        seen = (
+            (tilt_jump_rad(before, after, (end_ns - start_ns) * 1e-9), start_ns, end_ns)
+            for (start_ns, before), (end_ns, after) in pairwise(tilts)
+        )
+        return [
+            (math.degrees(change), (end_ns - start_ns) * 1e-9, end_ns)
+            for change, start_ns, end_ns in seen
+            if change
+        ]
+
+
+def find_stage(
+    reader: BagReader, config: MicroscopeConfig, image_topic: str
+) -> tuple[StageTrack | None, list[str]]:
+    """Read the stage of a recording, if it has one.
+
+    Parameters
+    ----------
+    reader
+        The open recording.
+    config
+        Its stage section says what to look for.
+    image_topic
+        Topic of the images: of several stages, the one in the same namespace is meant.
+
+    Returns
+    -------
+    track
+        None where there is no stage, or none that can be used.
+    notes
+        What is wrong with it.
+    """
+    if config.stage is None:
+        return None, []
+    topic, reason = _find_stage_topic(reader.topics, config.stage, image_topic)
+    if topic is None:
+        return None, [f"{reason}: {_UNUSED}"] if reason else []
+    try:
+        track = StageTrack(reader, topic.name, config)
+    except SemcalError as error:
+        return None, [f"{topic.name} cannot be read ({error}): {_UNUSED}"]
+    if problem := track.problem():
+        return None, [f"{topic.name}: {problem}: {_UNUSED}"]
+    return track, track.notes()
+
+
+def _find_stage_topic(
+    topics: tuple[BagTopic, ...], source: StageConfig, image_topic: str
+) -> tuple[BagTopic | None, str]:
+    named = [t for t in topics if t.count and topic_matches(source.topic, t.name)]
+    fitting = [t for t in named if t.type == source.type]
+    sibling = f"{image_topic.rpartition('/')[0]}/{source.topic}"
+    fitting = [t for t in fitting if t.name == sibling] or fitting
+    if len(fitting) == 1:
+        return fitting[0], ""
+    if fitting:
+        seen = ", ".join(t.name for t in fitting[:4])
+        return None, f"several topics could be the stage ({seen}); expected one {source.topic}"
+    if named:
+        return None, (
+            f"topic {named[0].name} has type {named[0].type}; expected {source.type} for the stage"
+        )
+    return None, ""
+
+
+class ConditionsTrack:
+    """What a recording says of the conditions at each image.
+
+    Parameters
+    ----------
+    reader, image_topic
+        The open recording; of several topics, those beside the images are meant.
+    """
+
+    def __init__(self, reader: BagReader, image_topic: str) -> None:
+        self._held: HeldValues[Conditions] | None = None
+        self._by_stamp: dict[int, Conditions] = {}
+        topic = _find_conditions_topic(reader, CONDITIONS_TOPIC, CONDITIONS_TYPE, image_topic)
+        if topic:
+            self._held = HeldValues(
+                reader, topic, lambda message: Conditions.from_topic(read_conditions(message))
+            )
+        metadata = _find_conditions_topic(reader, _METADATA_TOPIC, _METADATA_TYPE, image_topic)
+        if metadata:
+            for raw in reader.raw_messages([metadata]):
+                said = _read_metadata(reader.decode(raw))
+                if said is not None:
+                    self._by_stamp[said[0]] = said[1]
+
+    def at(self, stamp_ns: int, log_time_ns: int) -> Conditions | None:
+        """Return what is known at an image; an import's settings of the image itself count most."""
+        of_image = self._by_stamp.get(stamp_ns)
+        held = None if self._held is None else self._held.held_at(stamp_ns, log_time_ns)
+        found = of_image or held
+        return None if found == Conditions() else found
+
+
+def find_conditions(reader: BagReader, image_topic: str) -> ConditionsTrack | None:
+    """Read the conditions of a recording; None if there are none that can be read."""
+    try:
+        return ConditionsTrack(reader, image_topic)
+    except SemcalError:
+        return None
+
+
+def _find_conditions_topic(reader: BagReader, name: str, kind: str, image_topic: str) -> str:
+    named = [t.name for t in reader.topics if t.type == kind and topic_matches(name, t.name)]
+    sibling = f"{image_topic.rpartition('/')[0]}/{name}"
+    if sibling in named:
+        return sibling
+    return named[0] if len(named) == 1 else ""
+
+
+def _read_metadata(message: Any) -> tuple[int, Conditions] | None:
+    """Stamp and conditions of one image of an import; None for another text."""
+    text = getattr(message, "data", "")
+    if not isinstance(text, str) or len(text) > _LONGEST_TEXT:
+        return None
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    stamp_ns = data.get("stamp_ns") if isinstance(data, dict) else None
+    if not isinstance(stamp_ns, int):
+        return None
+    texts = {*(FILE_NAMES.get(key, key) for key in TEXTS), "beam"}
+    numbers = {*(FILE_NAMES.get(key, key) for key in NUMBERS), "frame_interval_s"}
+    numbers |= {"stage_tilt_rad", "stage_rotation_rad"}
+    known: dict[str, Any] = {}
+    for item in fields(Conditions):
+        value = data.get(item.name)
+        if item.name in texts and isinstance(value, str):
+            known[item.name] = value[:200]
+        elif item.name in numbers and type(value) in (int, float) and math.isfinite(value):
+            known[item.name] = float(value)
+    return stamp_ns, Conditions(**known)

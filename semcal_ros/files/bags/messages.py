@@ -24,13 +24,12 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions, fill_conditions
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.magnification import published_number
 from semcal_ros.config.config import IMAGE_TYPE, STAGE_TYPE, MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import BagError
-from semcal_ros.files.tiff.sem_image import Conditions
 
 _NOT_NUMERIC = ("string", "wstring")
 _NUMPY_NAMES = {"byte": "uint8", "char": "uint8", "bool": "bool"}

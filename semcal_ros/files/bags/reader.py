@@ -15,21 +15,26 @@
 """Read ROS 2 recordings (rosbag2) without ROS.
 
 Both storage formats (mcap, sqlite3), compressed or not, as a folder with ``metadata.yaml`` or as a
-single file.
+single file. What the bag library and its backends raise on damaged or foreign files becomes one error.
 
 ``AnyReader`` of rosbags would choose the message types too. But it registers the definitions of all
 topics when it opens a recording, so that a damaged definition on an unused topic would make the
 recording unreadable, and it generates code for arrays of any fixed length before they can be refused.
+
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import struct
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import apsw
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -37,13 +42,21 @@ from rosbags.interfaces import (
     Nodetype,
     QosDurability,
 )
-from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.rosbag2 import Reader, ReaderError, WriterError
+from rosbags.serde import SerdeError
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
 from rosbags.typesys.store import Typestore
+from ruamel.yaml.error import YAMLError
 
+from semcal_ros.config.config import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, ImageConfig
 from semcal_ros.core.errors import BagError, CalibrationFileError
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.errors import LIBRARY_ERRORS, check_types, one_line, reading, unreadable
 from semcal_ros.files.bags.messages import jazzy_types
 from semcal_ros.files.plain_yaml import check_plain_yaml
 from semcal_ros.text_files import name_similar_file, read_text_file
@@ -60,6 +73,41 @@ _MAX_METADATA = 16 * 1024 * 1024
 # the memory that a recording's definition can ask for.
 _MAX_UNROLLED = 1000
 _IDL_RULE = "=" * 80 + "\n"
+
+if sys.version_info >= (3, 14):
+    from compression.zstd import ZstdError
+else:
+    from backports.zstd import ZstdError
+
+
+# Damaged bytes surface from the parsers as errors of many kinds: lengths that overflow, unknown
+# keys, failed internal checks. The lz4 backend raises plain RuntimeError. These errors are only ever
+# caught around calls of the library.
+LIBRARY_ERRORS: tuple[type[Exception], ...] = (
+    ReaderError,
+    WriterError,
+    SerdeError,
+    TypesysError,
+    YAMLError,
+    ZstdError,
+    apsw.Error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    MemoryError,
+    RuntimeError,
+    AssertionError,
+)
+
+_MAX_REASON = 200  # characters: an error is one line
+_MAX_NAME = 255  # of DDS
+
+_MAX_LISTED = 8  # topics in one line of an error
 
 
 @dataclass(frozen=True)
@@ -411,3 +459,158 @@ def open_bag(path: str | Path) -> BagReader:
         The recording is missing, empty, truncated, or not a ROS 2 recording.
     """
     return BagReader(Path(path))
+
+
+def one_line(error: BaseException) -> str:
+    """Describe a library's error briefly, without line breaks and never empty."""
+    text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return text if len(text) <= _MAX_REASON else text[: _MAX_REASON - 3] + "..."
+
+
+def check_types(reader: Reader) -> None:
+    """Check values of an open reader that the library accepts unchecked.
+
+    Columns of sqlite3 and values of YAML can have any type and length.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A name is not text or too long, or the list of files is not a list.
+    """
+    files = getattr(reader.storage, "files", [])
+    if not isinstance(files, list):
+        # Otherwise the library could not close what it opened.
+        setattr(reader.storage, "files", [])  # noqa: B010
+        raise TypeError(f"the list of files is a {type(files).__name__}")
+    for connection in reader.connections:
+        if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+            raise TypeError(f"topic {connection.topic!r} of type {connection.msgtype!r}")
+        longest = max(len(connection.topic), len(connection.msgtype))
+        if longest > _MAX_NAME:
+            raise ValueError(f"a name of a topic or type of {longest} characters")
+
+
+def unreadable(path: Path, error: BaseException, what: str = "") -> BagError:
+    """Make the error for a recording that the library could not read."""
+    subject = f"{what} of {path}" if what else str(path)
+    return BagError(
+        f"cannot read {subject}: {one_line(error)}",
+        expected="an intact ROS 2 recording (mcap or sqlite3)",
+        do="if its recorder was interrupted, repair it with 'mcap recover' or 'ros2 bag reindex', "
+        "else copy it again",
+    )
+
+
+@contextmanager
+def reading(path: Path, what: str = "") -> Iterator[None]:
+    """Turn errors of the bag library inside the block into one :class:`BagError`."""
+    try:
+        yield
+    except BagError:
+        raise
+    except LIBRARY_ERRORS as error:
+        raise unreadable(path, error, what) from error
+
+
+def topic_matches(wanted: str, recorded: str) -> bool:
+    """Return whether a recorded topic is the wanted one: relative names match by their last parts."""
+    if wanted.startswith("/"):
+        return recorded == wanted
+    return recorded == wanted or recorded.endswith("/" + wanted)
+
+
+def _list_topics(topics: Sequence[BagTopic]) -> str:
+    shown = [f"{t.name} ({t.type}, {t.count})" for t in topics[:_MAX_LISTED]]
+    more = len(topics) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "") if shown else "no topics"
+
+
+def find_topic(
+    path: Path, topics: Sequence[BagTopic], *, what: str, wanted: str, type_name: str
+) -> tuple[BagTopic, str]:
+    """Find the topic to read; also return a note, empty if the topic has the configured name.
+
+    Parameters
+    ----------
+    topics
+        All topics of the recording.
+    what
+        What the topic carries, for messages to the user.
+    wanted, type_name
+        Name and message type from the configuration.
+
+    Raises
+    ------
+    BagError
+        No topic fits, several do, or the topic has another type.
+    """
+    named = [t for t in topics if topic_matches(wanted, t.name)]
+    fitting = [t for t in named if t.type == type_name]
+    if len(fitting) == 1:
+        return fitting[0], ""
+    if named and not fitting:
+        raise BagError(
+            f"topic {named[0].name} in {path} has type {named[0].type}",
+            expected=f"{type_name} for the {what}",
+            do="set topic and type in the msg_configs file and name it with --config",
+        )
+    candidates = fitting or [t for t in topics if t.type == type_name and t.count > 0]
+    if len(candidates) == 1:
+        return candidates[
+            0
+        ], f"the {what} is read from {candidates[0].name}: there is no topic {wanted}"
+    seen = _list_topics(candidates) if candidates else _list_topics(topics)
+    problem = "several topics could be" if candidates else "no topic is"
+    raise BagError(
+        f"in {path} {problem} the {what}; the topics are {seen}",
+        expected=f"one topic {wanted} of type {type_name}",
+        do="name the topic in a msg_configs file and pass it with --config",
+    )
+
+
+# Images that are matrices, and no pictures (doc/nodes.md).
+_MATRICES = ("projection_stamped", "projection_covariance_stamped")
+
+# What image_transport appends to the name of a topic for its compressed images.
+_SUFFIX = "/compressed"
+
+
+def find_image_topic(
+    path: Path, topics: Sequence[BagTopic], image: ImageConfig
+) -> tuple[BagTopic, list[str]]:
+    """Find the topic of images to read; also return notes. ``projection_stamped`` is not one unless it is configured.
+
+    A recorder often takes only one of ``image_raw`` and ``image_raw/compressed``, which show the same; if that is not
+    the configured one, the other is read, with a note.
+
+    Raises
+    ------
+    BagError
+        As :func:`~semcal_ros.files.bags.reader.find_topic`.
+    """
+    for matrix in _MATRICES:
+        if not topic_matches(matrix, image.topic):
+            topics = [topic for topic in topics if not topic_matches(matrix, topic.name)]
+    wanted, type_name = _source(image, [topic for topic in topics if topic.count])
+    found, note = find_topic(path, topics, what="image", wanted=wanted, type_name=type_name)
+    notes = [note] if note else []
+    if type_name != image.type:
+        notes.append(f"the images on {found.name} are {type_name}, not {image.type}")
+    return found, notes
+
+
+def _source(image: ImageConfig, filled: Sequence[BagTopic]) -> tuple[str, str]:
+    """Return the name and type to search for."""
+    other_name, other_type = f"{image.topic}{_SUFFIX}", COMPRESSED_IMAGE_TYPE
+    if image.type == COMPRESSED_IMAGE_TYPE:
+        other_name, other_type = image.topic.removesuffix(_SUFFIX), IMAGE_TYPE
+    for source in (
+        (image.topic, image.type),
+        (other_name, other_type),
+        (image.topic, other_type),
+    ):
+        if any((t.type, topic_matches(source[0], t.name)) == (source[1], True) for t in filled):
+            return source
+    types = {topic.type for topic in filled}
+    only_other = other_type in types and image.type not in types
+    return image.topic, other_type if only_other else image.type

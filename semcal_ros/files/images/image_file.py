@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from semcal_ros.core.errors import BagError, SemcalError, TiffError
+from semcal_ros.files.images.sem_image import VendorSettings
 from semcal_ros.files.images.tiff_stack import list_tiff_stack, read_tiff_stack
 from semcal_ros.files.tiff.read import (
     is_tiff,
@@ -40,7 +41,6 @@ from semcal_ros.files.tiff.read import (
     read_sem_pages,
     side_file_settings,
 )
-from semcal_ros.files.tiff.sem_image import VendorSettings
 from semcal_ros.files.video import VIDEO_SUFFIXES, describe_video, read_video
 
 #: Suffixes of these files.

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.stage import doubt_unit
 from semcal_ros.config.config import StageConfig
 from semcal_ros.core.calibration.stage import StageReading
@@ -43,8 +44,7 @@ from semcal_ros.files.images.image_file import (
     describe_image_file,
     is_image_file,
 )
-from semcal_ros.files.tiff.same_scan import group_by_scan
-from semcal_ros.files.tiff.sem_image import Conditions
+from semcal_ros.files.images.sem_image import VendorSettings
 from semcal_ros.text_files import name_similar_file
 
 _SECOND_NS = 1_000_000_000
@@ -57,6 +57,8 @@ _SAME_SCALE = 5e-3
 _EXAMINED = 3
 # A stage that turns back comes back to a fraction of this, rad.
 _TURNED_RAD = 1e-3
+
+_STAMP_S = 1.0  # makers give whole seconds
 
 
 @dataclass(frozen=True)
@@ -599,3 +601,57 @@ def list_image_series(
             *group_skipped(left_out),
         ),
     )
+
+
+def _can_be_one_scan(first: VendorSettings, other: VendorSettings) -> bool:
+    """Whether the same pass of the beam can have made two images.
+
+    Scan, stage and microscope must be the same, and the second image must have come before a second pass can have
+    ended: within a frame time, or within the whole second that the stamps resolve.
+    """
+    same = (
+        "maker", "model", "serial_number", "beam", "acceleration_voltage_v", "pixel_size_m", "pixel_size_y_m",
+        "working_distance_m", "scan_rotation_rad", "stage_tilt_rad", "stage_rotation_rad", "dwell_s", "frame_time_s",
+    )  # fmt: skip
+    if first.time is None or other.time is None:
+        return False
+    apart_s = abs((other.time - first.time).total_seconds())
+    in_one_pass = apart_s == 0.0 or apart_s + _STAMP_S <= (first.frame_time_s or 0.0)
+    return in_one_pass and all(getattr(first, name) == getattr(other, name) for name in same)
+
+
+def group_by_scan(
+    images: Sequence[tuple[VendorSettings, tuple[int, int]]],
+) -> tuple[tuple[int, ...], ...]:
+    """Group images whose detectors saw the same pass of the beam.
+
+    Images without a detector or a time stand alone, and so does each of two images of one detector, which are two
+    scans even in the same second.
+
+    Parameters
+    ----------
+    images
+        Settings and stored (width, height) of each image.
+
+    Returns
+    -------
+    tuple
+        Indices of each scan's images, in the order of the first of them; each index once.
+    """
+    groups: list[list[int]] = []
+    for index, (settings, size_px) in enumerate(images):
+        for group in groups:
+            first, first_size_px = images[group[0]]
+            detectors = {images[member][0].detector for member in group}
+            if (
+                settings.detector
+                and "" not in detectors
+                and settings.detector not in detectors
+                and size_px == first_size_px
+                and _can_be_one_scan(first, settings)
+            ):
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    return tuple(tuple(group) for group in groups)

@@ -25,18 +25,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from semcal_ros.bridge.conditions import CONDITIONS_TYPE
-from semcal_ros.bridge.headers import fill_header
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions
+from semcal_ros.bridge.fields import fill_header
 from semcal_ros.bridge.images import fill_image
-from semcal_ros.config.config import (
-    IMAGE_TYPE,
-    MicroscopeConfig,
-    StageConfig,
-    load_config,
-)
+from semcal_ros.config.config import IMAGE_TYPE, MicroscopeConfig, StageConfig, load_config
 from semcal_ros.core.errors import BagError, SemcalError
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.conditions import CONDITIONS_TOPIC
+from semcal_ros.files.bags.held_values import CONDITIONS_TOPIC
 from semcal_ros.files.bags.messages import (
     blank_message,
     check_recordable,
@@ -53,8 +48,8 @@ from semcal_ros.files.images.image_series import (
     Skipped,
     group_skipped,
 )
+from semcal_ros.files.images.sem_image import SemImage
 from semcal_ros.files.recordings import ENCODINGS, RecordedFiles, open_image_series
-from semcal_ros.files.tiff.sem_image import Conditions, SemImage
 
 METADATA_TOPIC = "metadata"
 """Topic with the settings of each image as JSON text (std_msgs/String)."""

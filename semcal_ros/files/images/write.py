@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
-from semcal_ros.files.images.ome_tiff import DATABAR_ROWS, OmeTiffWriter, open_ome_tiff
 from semcal_ros.files.images.scale_bar import add_databar, choose_scale_bar
+from semcal_ros.files.images.tiff_stack import DATABAR_ROWS, OmeTiffWriter, open_ome_tiff
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 IMAGE_SUFFIXES = (*TIFF_SUFFIXES, ".png")

@@ -26,8 +26,7 @@ import re
 from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     angle_in_degrees,
     check_pixel_size,
     first_date,
@@ -35,6 +34,7 @@ from semcal_ros.files.tiff.values import (
     positive,
     quantity,
 )
+from semcal_ros.files.images.sem_image import VendorSettings
 
 USUAL_DISPLAY_WIDTH_M = 0.127
 """Width of the photograph (5 x 4 inches) to which Hitachi's magnification refers."""

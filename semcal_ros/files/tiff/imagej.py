@@ -30,14 +30,14 @@ from pathlib import Path
 import tifffile
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     check_pixel_size,
     duration,
     plain_number,
     positive,
     quantity,
 )
+from semcal_ros.files.images.sem_image import VendorSettings
 
 # ImageJ's private TIFF tag, IJMetadata.
 _TAG = 50839

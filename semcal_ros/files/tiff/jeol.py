@@ -25,14 +25,14 @@ import math
 from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     check_pixel_size,
     first_date,
     plain_number,
     positive,
     quantity,
 )
+from semcal_ros.files.images.sem_image import VendorSettings
 
 USUAL_DISPLAY_WIDTH_M = 0.128
 """Width of the photograph to which JEOL's magnification usually refers.

@@ -24,14 +24,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     aspect_notes,
     check_pixel_size,
     is_credible_year,
     plain_number,
     positive,
 )
+from semcal_ros.files.images.sem_image import VendorSettings
 
 # OlympusSIS.
 TAG = 33560

@@ -23,9 +23,15 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import check_pixel_size, positive
-from semcal_ros.files.tiff.xml_tag import date_of, number_of, quantity_of, text_of
+from semcal_ros.files.images.metadata import (
+    check_pixel_size,
+    date_of,
+    number_of,
+    positive,
+    quantity_of,
+    text_of,
+)
+from semcal_ros.files.images.sem_image import VendorSettings
 
 ROOT = "FeiImage"
 

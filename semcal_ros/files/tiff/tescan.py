@@ -25,8 +25,7 @@ import struct
 from pathlib import Path
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     check_pixel_size,
     decode_text,
     first_date,
@@ -34,6 +33,7 @@ from semcal_ros.files.tiff.values import (
     positive,
     tilt_correction_note,
 )
+from semcal_ros.files.images.sem_image import VendorSettings
 
 # TESCAN's private TIFF tag.
 TAG = 50431

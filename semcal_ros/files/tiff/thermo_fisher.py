@@ -28,16 +28,19 @@ from typing import Any
 from xml.etree import ElementTree
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     aspect_notes,
     check_pixel_size,
+    date_of,
     first_date,
+    number_of,
     plain_number,
     positive,
+    quantity_of,
+    text_of,
     tilt_correction_note,
 )
-from semcal_ros.files.tiff.xml_tag import date_of, number_of, quantity_of, text_of
+from semcal_ros.files.images.sem_image import VendorSettings
 
 # Private TIFF tags of FEI, now Thermo Fisher: FEI_HELIOS and FEI_SFEG.
 TAGS = (34682, 34680)

@@ -36,8 +36,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from semcal_ros.files.tiff.sem_image import VendorSettings
-from semcal_ros.files.tiff.values import (
+from semcal_ros.files.images.metadata import (
     angle_in_degrees,
     check_pixel_size,
     duration,
@@ -48,6 +47,7 @@ from semcal_ros.files.tiff.values import (
     rounding,
     tilt_correction_note,
 )
+from semcal_ros.files.images.sem_image import VendorSettings
 
 # Private TIFF tag of Zeiss, CZ_SEM.
 TAG = 34118

@@ -25,6 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.diagnostics import DiagnosticLevel
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
@@ -35,9 +36,8 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError, Microsco
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
-from semcal_ros.files.bags.view_recorder import ViewRecorder
+from semcal_ros.files.bags.writer import ViewRecorder
 from semcal_ros.files.recordings import RecordedFrame
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.acquisition.commands import MicroscopeCommands
 from semcal_ros.nodes.acquisition.ladder import LadderGoal, LadderRun, ladder_goal_of, place_of
 from semcal_ros.nodes.acquisition.recorded import read_pictures, read_views
@@ -339,7 +339,7 @@ class AcquisitionDriver:
         )
 
     def find_grid(self) -> LatticeDetection | None:
-        """See :class:`~semcal_ros.nodes.acquisition.follow.GridFinder`."""
+        """See :class:`~semcal_ros.nodes.acquisition.run.GridFinder`."""
         newest = self._state.now.newest
         found = None if newest is None else find_lattice(newest.grey)
         return None if isinstance(found, Rejection) else found

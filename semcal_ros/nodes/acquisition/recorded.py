@@ -23,6 +23,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.stage import StageReading
@@ -30,7 +31,6 @@ from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.files.recordings import RecordedFrame, open_recording
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.find_grid import count_visits
 
 #: Says whether a picture is one of the views: its magnification, grey levels, corners, and the stage.
@@ -58,7 +58,7 @@ def read_views(
     Parameters
     ----------
     path
-        A recording of :class:`~semcal_ros.files.bags.view_recorder.ViewRecorder`.
+        A recording of :class:`~semcal_ros.files.bags.writer.ViewRecorder`.
     config
         How to read it.
     size

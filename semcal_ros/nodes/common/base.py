@@ -39,10 +39,9 @@ from semcal_ros.bridge.diagnostics import (
 )
 from semcal_ros.config.config import load_config
 from semcal_ros.core.wording import nearest_name
-from semcal_ros.nodes.common.command_line import HelpWanted, command_line, is_quality
+from semcal_ros.nodes.common.command_line import EXECUTABLES, HelpWanted, command_line, is_quality
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
-from semcal_ros.nodes.common.help import EXECUTABLES
 from semcal_ros.nodes.common.parameters import (
     CONFIG,
     DIAGNOSTICS_PERIOD,

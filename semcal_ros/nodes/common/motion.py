@@ -24,11 +24,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
-from semcal_ros.bridge.diagnostics import (
-    DiagnosticLevel,
-    DiagnosticSummary,
-    fill_diagnostic_status,
-)
+from semcal_ros.bridge.diagnostics import DiagnosticLevel, DiagnosticSummary, fill_diagnostic_status
 from semcal_ros.config.config import StageConfig
 from semcal_ros.core.errors import MicroscopeError, SemcalError
 from semcal_ros.drivers.limits import MotionLimits, describe_target, joint_unit

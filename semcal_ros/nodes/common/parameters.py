@@ -12,12 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Parameters of a node: declared once with description, unit and range, refused with a reason, applied live."""
+"""Parameters of a node: declared once with description, unit and range, refused with a reason, applied live.
+
+Files that are named while a node runs, such as by a service, lie in one folder.
+
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +37,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.files.confined import AllowedPaths
 
 Check = Callable[[Any], object]
 Apply = Callable[[Any], None]
@@ -122,6 +126,7 @@ CONFIG = ParameterDeclaration(
     "Description of the microscope's topics: a msg_configs file or the name of one that is shipped.",
     fixed=True,
 )
+
 DIAGNOSTICS_PERIOD = ParameterDeclaration(
     "diagnostics_period",
     1.0,
@@ -131,18 +136,21 @@ DIAGNOSTICS_PERIOD = ParameterDeclaration(
     high=60.0,
     fixed=True,
 )
+
 DIRECTORY = ParameterDeclaration(
     "directory",
     "",
     "Folder of the files that are named while the node runs; empty: that of the file given at start.",
     fixed=True,
 )
+
 CALIBRATION = ParameterDeclaration(
     "calibration",
     "",
     "Calibration file; empty to wait for one on the topic `calibration`.",
     confined=True,
 )
+
 REPLAYED_CALIBRATION = ParameterDeclaration(
     "replayed_calibration",
     "ignore",
@@ -150,6 +158,7 @@ REPLAYED_CALIBRATION = ParameterDeclaration(
     " is in force already.",
     choices=("ignore", "take"),
 )
+
 INTERPOLATION = ParameterDeclaration(
     "interpolation",
     "linear",
@@ -238,3 +247,65 @@ class Parameters:
                 continue
             if parameter.name in self._applies:
                 self._applies[parameter.name](self._values[parameter.name])
+
+
+def _resolve(path: str, directory: str = "") -> Path:
+    try:
+        return Path(os.path.realpath(os.path.join(directory, os.path.expanduser(path))))
+    except ValueError as error:
+        raise InvalidValueError(f"file name {path!r} ({error})", expected="a path") from error
+
+
+class AllowedPaths:
+    """The files that may be named.
+
+    Parameters
+    ----------
+    directory
+        Folder in which the files must lie, and from which relative names start. Empty: the folders of
+        ``trusted``, and the working directory.
+    trusted
+        Files named at the start, which are allowed wherever they are.
+
+    Raises
+    ------
+    InvalidValueError
+        ``directory`` is not a folder.
+    """
+
+    def __init__(self, directory: str = "", trusted: Sequence[str] = ()) -> None:
+        self._start = str(_resolve(directory)) if directory else ""
+        self._trusted = tuple(_resolve(path, self._start) for path in trusted)
+        self._folders = tuple(path.parent for path in self._trusted)
+        if directory:
+            folder = Path(self._start)
+            if not folder.is_dir():
+                raise InvalidValueError(
+                    f"directory {directory}, which is not a folder", expected="an existing folder"
+                )
+            self._folders = (folder,)
+
+    def resolve(self, path: str) -> Path:
+        """Return the file itself: ``~``, ``..`` and all symbolic links are resolved as they are now.
+
+        Raises
+        ------
+        InvalidValueError
+            The file lies elsewhere.
+        """
+        real = _resolve(path, self._start)
+        if real in self._trusted or any(real.is_relative_to(folder) for folder in self._folders):
+            return real
+        if not self._folders:
+            raise InvalidValueError(
+                f"file {path}, but no folder whose files may be named while the node runs",
+                expected="the parameter directory to name one",
+                do="start the node with -p directory:=FOLDER",
+            )
+        folders = " or ".join(str(folder) for folder in dict.fromkeys(self._folders))
+        behind = "" if str(real) == path else f", which is {real}"
+        raise InvalidValueError(
+            f"file {path}{behind}",
+            expected=f"a file inside {folders}",
+            do="choose one there, or start the node with another directory",
+        )

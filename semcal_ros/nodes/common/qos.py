@@ -20,13 +20,7 @@ Users override it by ``qos_overrides`` parameters.
 from __future__ import annotations
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSPolicyKind,
-    QoSProfile,
-    ReliabilityPolicy,
-)
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 # Limit of the middleware, which counts in signed 32 bit integers.

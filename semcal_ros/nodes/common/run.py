@@ -48,11 +48,9 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
 from semcal_ros.core.errors import ConfigError, SemcalError
-from semcal_ros.middleware.ament_prefix import add_environment_prefix
-from semcal_ros.middleware.security import check_security
+from semcal_ros.middleware import add_environment_prefix, check_security
 from semcal_ros.nodes.common.base import SemNode
-from semcal_ros.nodes.common.command_line import CommandLine, HelpWanted, starting_with
-from semcal_ros.nodes.common.help import format_help
+from semcal_ros.nodes.common.command_line import CommandLine, HelpWanted, format_help, starting_with
 
 Made = TypeVar("Made")
 

@@ -34,10 +34,9 @@ from semcal_ros.nodes.common.parameters import (
     REPLAYED_CALIBRATION,
     ParameterDeclaration,
 )
-from semcal_ros.nodes.frames.calibration_input import CalibrationInput
-from semcal_ros.nodes.frames.calibration_range import OUT_OF_RANGE, RangeWatch
+from semcal_ros.nodes.frames.calibration_input import OUT_OF_RANGE, CalibrationInput, RangeWatch
 from semcal_ros.nodes.frames.compressed import compressed_parameters
-from semcal_ros.nodes.frames.conditions import ON_MISMATCH, ConditionsWatch
+from semcal_ros.nodes.frames.held_values import ON_MISMATCH, ConditionsWatch
 from semcal_ros.nodes.frames.outputs import RectifiedOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, StreamNode
 

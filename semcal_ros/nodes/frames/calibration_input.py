@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The calibration in force: the latest one from a file or from the topic."""
+"""The calibration in force, the latest from a file or from the topic; and whether a magnification is in its range."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ from typing import Any
 
 from std_msgs.msg import String
 
-from semcal_ros.bridge.calibration_text import (
+from semcal_ros.bridge.calibration import (
+    ScaleWarnings,
     calibration_text_from_message,
     fill_calibration_text,
+    read_scale_warnings,
 )
-from semcal_ros.bridge.calibration_warnings import ScaleWarnings, read_scale_warnings
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -37,7 +38,11 @@ from semcal_ros.core.errors import CalibrationFileError, SemcalError
 from semcal_ros.files.calibration_file import read_calibration_text
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.latest_worker import LatestWorker
-from semcal_ros.nodes.common.parameters import CALIBRATION, REPLAYED_CALIBRATION
+from semcal_ros.nodes.common.parameters import (
+    CALIBRATION,
+    REPLAYED_CALIBRATION,
+    ParameterDeclaration,
+)
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.reporter import Reporter
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
@@ -52,6 +57,15 @@ _KEPT_DIGESTS = 16
 _QUEUE = 10
 # Names that the players of recordings have: that of this suite, and that of `ros2 bag play`.
 _PLAYERS = ("bag_player", "rosbag2_player")
+
+OUT_OF_RANGE = ParameterDeclaration(
+    "out_of_range",
+    "flag",
+    "What is said of the camera at magnifications that the calibration does not cover, where images are rectified"
+    " by its continuation. flag: camera_info and projection_stamped are zero, as without a calibration."
+    " extrapolate: they are those of that continuation.",
+    choices=("flag", "extrapolate"),
+)
 
 
 def calibration_digest(text: str) -> str:
@@ -301,3 +315,33 @@ class CalibrationInput:
         self._reporter.note("calibration", source)
         self._reporter.note("calibration_digest", digest)
         self._warnings = report_scale_warnings(self._reporter, calibration)
+
+
+class RangeWatch:
+    """Notes ``in_calibrated_range``, and logs when the range is left and entered again.
+
+    Parameters
+    ----------
+    reporter
+        Where to note and to log.
+    """
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+        self.is_outside = False
+
+    def check(
+        self, calibration: Calibration | None, camera: ScanCamera | None, magnification: float
+    ) -> None:
+        """Take the camera in use at a magnification; both are None without a calibration."""
+        outside = camera is not None and not camera.in_range
+        self._reporter.note("in_calibrated_range", camera is not None and not outside)
+        if outside == self.is_outside or calibration is None:
+            return
+        self.is_outside = outside
+        low, high = calibration.magnification_range
+        covered = f"the calibrated range {low:g}x to {high:g}x"
+        if outside:
+            self._reporter.warn(f"{magnification:g}x is outside of {covered}")
+        else:
+            self._reporter.info(f"{magnification:g}x is inside of {covered} again")

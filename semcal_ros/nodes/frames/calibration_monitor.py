@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.images import to_gray
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
@@ -36,13 +36,13 @@ from semcal_ros.core.calibration.views import FoundView
 from semcal_ros.core.corners import find_lattice
 from semcal_ros.core.errors import Rejection, SemcalError
 from semcal_ros.files.images.databar import DatabarCutter
-from semcal_ros.middleware.message_types import message_class
+from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import glimpse_input
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
-from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.held_values import MagnificationInput
 from semcal_ros.workflows.check_and_update import check_found
 
 # One check of a hundred calls a valid calibration degraded, and there are thousands of them: so many in a row have to.

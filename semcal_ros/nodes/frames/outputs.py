@@ -25,16 +25,15 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from semcal_ros.bridge.camera_info import fill_camera_info, fill_raw_camera_info
-from semcal_ros.bridge.drift import (
-    fill_drift,
-    fill_drift_velocity,
-    rotation_of,
-    rotation_rate_of,
-)
-from semcal_ros.bridge.headers import copy_header
+from semcal_ros.bridge.drift import fill_drift, fill_drift_velocity, rotation_of, rotation_rate_of
+from semcal_ros.bridge.fields import copy_header
 from semcal_ros.bridge.images import fill_image, pixel_memory
-from semcal_ros.bridge.projection import fill_stamped_projection, fill_stamped_projection_covariance
+from semcal_ros.bridge.projection import (
+    fill_camera_info,
+    fill_raw_camera_info,
+    fill_stamped_projection,
+    fill_stamped_projection_covariance,
+)
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.rectification.rectifier import Rectifier
@@ -218,7 +217,7 @@ class RectifiedOutput:
         self, message: Any, camera: ScanCamera | None, header: Any, width: int, height: int
     ) -> None:
         # For a subscriber that most streams do not have: scipy.optimize takes 20 MB and tenths of a second.
-        from semcal_ros.core.camera.plumb_bob import fit_plumb_bob
+        from semcal_ros.core.camera.pinhole_model import fit_plumb_bob
 
         model = None if camera is None else fit_plumb_bob(camera, width, height)
         if model is not None:

@@ -21,7 +21,7 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.bridge.stage import (
     doubt_unit,
     missing_joints,
@@ -32,7 +32,7 @@ from semcal_ros.bridge.stage import (
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.errors import SemcalError
-from semcal_ros.middleware.message_types import message_class
+from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import value_input
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns

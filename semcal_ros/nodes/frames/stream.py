@@ -31,15 +31,14 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from semcal_ros.bridge.compressed import decoded_image
-from semcal_ros.bridge.headers import stamp_ns_from_msg
+from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.config.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.files.images.databar import DatabarCutter
-from semcal_ros.middleware.message_types import message_class
-from semcal_ros.middleware.transport_advice import transport_advice
+from semcal_ros.middleware import message_class, transport_advice
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.endpoints import Endpoints
@@ -47,7 +46,7 @@ from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import image_input, stream_output
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.subscription import MessageInfo, published_ns
-from semcal_ros.nodes.frames.magnification import MagnificationInput
+from semcal_ros.nodes.frames.held_values import MagnificationInput
 
 # The camera stays the same from frame to frame as long as the magnification does.
 nominal_camera = lru_cache(maxsize=4)(ScanCamera.nominal)

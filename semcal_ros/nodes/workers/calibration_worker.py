@@ -27,16 +27,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from semcal_ros.bridge.conditions import Conditions
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.calibration.judgement.plan import judge_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import CalibrationError, SemcalError
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
 from semcal_ros.workflows.extend import extend_by_pictures

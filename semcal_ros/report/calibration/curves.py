@@ -26,8 +26,8 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.html.encode import Readings
+from semcal_ros.report.html.page import format_magnification
 from semcal_ros.report.html.style import INK, SECOND
-from semcal_ros.report.html.text import format_magnification
 
 # Points of a curve: closer together than a line of the figure bends.
 _SAMPLES = 81

@@ -12,38 +12,46 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tables of a calibration report, in readable units.
+"""Tables of a calibration report, in readable units, and errors that are computed for them.
 
 They are: the calibrated magnifications; the figures of the paper, Malti et al. (2012),
 doi:10.1117/1.JEI.21.3.033020, next to those of the calibration; and the camera with its scale, distortion and
 uncertainty at each step of a slider over the magnification.
+
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.judgement.findings import find_all
 from semcal_ros.core.calibration.views import RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.conditions import describe_condition
-from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
-from semcal_ros.core.camera.provenance import NOT_RECORDED, Provenance
+from semcal_ros.core.camera.projection import PARAMETER_NAMES, project_points_with_jacobians
+from semcal_ros.core.camera.records import NOT_RECORDED, Provenance
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.term_sizes import describe_term_sizes, has_terms, measure_terms
-from semcal_ros.report.calibration.geometry import compute_displacements
-from semcal_ros.report.html.text import (
+from semcal_ros.core.camera.uncertainty import make_field_lattice, predict_shape_sigma_px
+from semcal_ros.report.html.page import (
     format_length,
     format_magnification,
     format_px,
     remove_control_characters,
 )
+
+# Prior on the change of a pose without distortion, rad: directions that a view does not constrain
+# must not diverge.
+_TURN_RAD = 0.1
+# The same for the height, m.
+_HEIGHT_M = 1e-4
 
 # Malti et al. (2012), doi:10.1117/1.JEI.21.3.033020: 0.9 in the abstract, 1.45 in section 4.1.3.
 PAPER_RMS_PX = (0.9, 1.45)
@@ -58,6 +66,50 @@ _PAPER_STRAIGHT_PX = 3.0
 # Steps of the slider: a step is less than a tenth of a factor of two over a range of 100.
 _STEPS = 81
 _ACROSS = 9
+
+
+def compute_displacements(camera: ScanCamera, across: int = 13) -> tuple[Array, Array]:
+    """Compute ideal pixels on a lattice and their displacements; NaN where undefined."""
+    xy = make_field_lattice(camera.width, camera.height, across)
+    return xy, camera.distort(xy) - xy
+
+
+def remove_residual_field(camera: ScanCamera) -> ScanCamera:
+    """Return the camera with only its parametric distortion."""
+    return replace(camera, residual=None)
+
+
+def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, float]:
+    """Compute the RMS error in px at each magnification without distortion correction.
+
+    The poses are fitted again, linearly about those of the result.
+    """
+    squares: dict[float, list[Array]] = {}
+    pull = np.diag([1.0 / _TURN_RAD] * 3 + [0.0, 0.0, 1.0 / _HEIGHT_M])
+    poses = zip(result.fit.rotations, result.fit.translations_m, strict=True)
+    for view, (rotation, translation) in zip(result.views, poses, strict=True):
+        camera = remove_residual_field(result.model.at(view.magnification))
+        straight = camera.parameters[: len(PARAMETER_NAMES)].copy()
+        straight[[PARAMETER_NAMES.index("xi_r"), PARAMETER_NAMES.index("xi_t")]] = 0.0
+        turned = view.board_xy_m @ rotation[:, :2].T
+        points = turned + translation
+        jacobian = project_points_with_jacobians(straight, points, camera.raster).d_xyz
+        x, y, z = turned.T
+        o = np.zeros_like(x)
+        turns = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
+        columns = np.concatenate([jacobian @ turns, jacobian], axis=2)
+        error = view.known_residuals(view.image_xy - camera.project_ideal(points))
+        columns = np.stack([view.known_residuals(columns[..., k]) for k in range(6)], axis=2)
+        columns, error = columns.reshape(-1, 6), error.ravel()
+        known = np.isfinite(error) & np.all(np.isfinite(columns), axis=1)
+        normal = columns[known].T @ columns[known] + pull.T @ pull
+        scaled, scale = equilibrate(normal)
+        right = scale * (columns[known].T @ error[known])
+        step = scale * np.linalg.lstsq(scaled, right, rcond=None)[0]
+        squares.setdefault(float(view.magnification), []).append(
+            view.dimensions * (error[known] - columns[known] @ step) ** 2
+        )
+    return {g: float(np.sqrt(np.mean(np.concatenate(s)))) for g, s in sorted(squares.items())}
 
 
 @dataclass(frozen=True)

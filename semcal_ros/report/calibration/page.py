@@ -37,7 +37,6 @@ from semcal_ros.core.calibration.views import FoundView, RejectedView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.wording import in_nm, rounded_magnification
-from semcal_ros.report.calibration.blink import choose_blink
 from semcal_ros.report.calibration.coverage_figures import (
     plot_coverage,
     plot_reached_shares,
@@ -48,32 +47,38 @@ from semcal_ros.report.calibration.curves import parts_by_specimen
 from semcal_ros.report.calibration.error_figures import (
     plot_distortion,
     plot_mean_residuals,
+    plot_predicted_errors,
     plot_residual_field,
     plot_residual_histogram,
     plot_residuals,
     plot_rms,
 )
-from semcal_ros.report.calibration.examples import (
-    choose_examples,
-    overlay_corners,
-    show_rejected,
-)
-from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.numbers import (
     collect_facts,
     collect_warnings,
     compute_fitted_inner_px,
     compute_held_out_px,
+    compute_rms_without_distortion,
     tabulate_beside_paper,
     tabulate_cameras,
     tabulate_magnifications,
 )
 from semcal_ros.report.calibration.parameter_figures import plot_parameters, plot_pixel_sizes
-from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
-from semcal_ros.report.calibration.worst_views import choose_worst_views
+from semcal_ros.report.calibration.view_pictures import (
+    choose_blink,
+    choose_examples,
+    choose_worst_views,
+    overlay_corners,
+    show_rejected,
+)
 from semcal_ros.report.html.encode import encode_pictures
-from semcal_ros.report.html.page import render, write_page
-from semcal_ros.report.html.text import format_length, format_px, remove_control_characters
+from semcal_ros.report.html.page import (
+    format_length,
+    format_px,
+    remove_control_characters,
+    render,
+    write_page,
+)
 
 # Example images on a page, at most: they make most of its size.
 _MAX_OVERLAYS = 24

@@ -34,6 +34,7 @@ from semcal_ros.report.calibration.curves import (
     set_limits_with_room,
 )
 from semcal_ros.report.html.encode import Picture, encode_figure
+from semcal_ros.report.html.page import format_length, format_with_sigma
 from semcal_ros.report.html.style import (
     OURS,
     SECOND,
@@ -43,7 +44,6 @@ from semcal_ros.report.html.style import (
     set_magnification_axis,
     style_axes,
 )
-from semcal_ros.report.html.text import format_length, format_with_sigma
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from PIL import Image  # matplotlib writes its PNG files with it
 
 from semcal_ros.core.arrays import Array, check_image
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.report.html.text import remove_control_characters
+from semcal_ros.report.html.page import remove_control_characters
 
 # Two dots of the file per CSS pixel of the page (96 per inch), so that figures are sharp on
 # high-resolution screens.

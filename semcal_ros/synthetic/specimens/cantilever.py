@@ -17,7 +17,8 @@
 A beam leaves a holder and ends over a textured background. A plane comes from one side, pushes its
 end and is drawn back, while the specimen as a whole drifts. Coordinates of the scene: the base is
 the origin, the beam at rest lies along +x, and the pusher moves it towards +y, or towards -y if it
-comes from there.
+comes from there. Beams, substrates and pushes of many looks can be drawn at random, so that nothing is tuned to one.
+
 """
 
 from __future__ import annotations
@@ -33,17 +34,20 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic.detector import Detector
-from semcal_ros.synthetic.drift import NO_DRIFT, DriftFunction
+from semcal_ros.synthetic.drift import NO_DRIFT, Drift, DriftFunction
 from semcal_ros.synthetic.microscope import VirtualMicroscope
 from semcal_ros.synthetic.pose import Pose
 from semcal_ros.synthetic.render import render_frame
 from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
-from semcal_ros.synthetic.specimens.substrate import Substrate
-from semcal_ros.synthetic.specimens.thresholds import (
+from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
+from semcal_ros.synthetic.thresholds import (
     CANTILEVER_MAGNIFICATIONS,
     CANTILEVER_PUSHES,
     FREE_GAP_M,
 )
+
+#: Names of the outlines of a free end.
+TIPS = ("square", "semicircular", "tapered", "chamfered")
 
 
 @dataclass(frozen=True)
@@ -463,3 +467,125 @@ def _place_specimen(
     c, s = math.cos(turn), math.sin(turn)
     at = seen - middle * np.array([c, s])
     return Pose.flat((float(at[0]), float(at[1]), 0.0), turn)
+
+
+@dataclass(frozen=True)
+class CantileverExperiment:
+    """What is recorded, and how it is pushed and drifts.
+
+    Attributes
+    ----------
+    tip, substrate
+        Names, for tables.
+    scene, largest_deflection_m, rotation_rad, drift
+        As :func:`~semcal_ros.synthetic.specimens.cantilever.cantilever_plan` takes them.
+    """
+
+    tip: str
+    substrate: str
+    scene: CantileverScene
+    largest_deflection_m: float
+    rotation_rad: float
+    drift: Drift
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether the beam is darker than the ground."""
+        assert self.scene.substrate is not None
+        return self.scene.beam < self.scene.substrate.level
+
+
+def make_tip(name: str, width_m: float, rng: np.random.Generator) -> BeamTip:
+    """Make a tip of a kind in :data:`TIPS` for a beam of a width; sizes are drawn where a kind has several."""
+    if name == "semicircular":
+        return BeamTip(0.5 * width_m, 0.0, "elliptic")
+    if name == "tapered":
+        return BeamTip(width_m * rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.5))
+    if name == "chamfered":
+        cut = rng.uniform(0.12, 0.3)
+        return BeamTip(cut * width_m, 1.0 - 2.0 * cut)
+    return SQUARE_TIP
+
+
+def random_cantilever(seed: int, *, base_in_view: bool = False) -> CantileverExperiment:
+    """Draw an experiment.
+
+    Tips, substrates and contrast take turns with the seed, so that ten seeds hold all of each; sizes,
+    levels, texture, charging, direction and push are drawn. What is drawn is what published images of
+    microcantilevers show: beams of 30 to 40 um by 2.5 to 4.5 um, pushed by 150 to 300 nm.
+
+    Parameters
+    ----------
+    seed
+        Seed, from 0.
+    base_in_view
+        Whether the holder will be in view. Without it there is no smooth substrate, on which nothing
+        would show the drift.
+    """
+    rng = np.random.default_rng([seed, 816])
+    kinds = SUBSTRATES if base_in_view else SUBSTRATES[:-1]
+    # Four tips against five or four substrates: the shift keeps pairs from repeating.
+    tip = TIPS[seed % len(TIPS)]
+    kind = kinds[(seed + seed // len(kinds)) % len(kinds)]
+    dark = seed % 3 == 2
+    length_m, width_m = rng.uniform(30e-6, 40e-6), rng.uniform(2.5e-6, 4.5e-6)
+    levels = _draw_dark(rng) if dark else _draw_bright(rng)
+    contrast = rng.uniform(0.04, 0.1)
+    size_m = float(np.exp(rng.uniform(*np.log([0.8e-6, 4e-6]))))
+    outline = make_tip(tip, width_m, rng)
+    # The pusher touches the straight side, just before the tip.
+    touched = length_m - outline.length_m - rng.uniform(0.01, 0.05) * length_m
+    turn = rng.uniform(0.0, 2.0 * math.pi)
+    halo = rng.uniform(-0.06, 0.1)
+    scene = CantileverScene(
+        length_m=length_m,
+        width_m=width_m,
+        pusher_m=(touched, touched + rng.uniform(3e-6, 6e-6)),
+        rim=levels["rim"],
+        rim_m=rng.uniform(80e-9, 250e-9),
+        beam=levels["beam"],
+        holder=levels["holder"],
+        pusher=levels["pusher"],
+        tip=outline,
+        substrate=Substrate(_kind(kind), levels["ground"], contrast, size_m, seed),
+        charging=Charging(
+            (5e3 * math.cos(turn), 5e3 * math.sin(turn)), halo, rng.uniform(0.3e-6, 1.5e-6)
+        ),
+        push_direction=1 if rng.uniform() < 0.5 else -1,
+    )
+    drift = Drift(
+        velocity_m_s=tuple(rng.normal(0.0, 1e-9, 2)),
+        settling_m=tuple(rng.normal(0.0, 80e-9, 2)),
+        wander_m=12e-9,
+        seed=seed,
+    )
+    pushed_m, rotation = rng.uniform(150e-9, 300e-9), rng.uniform(-math.pi, math.pi)
+    return CantileverExperiment(tip, kind, scene, pushed_m, rotation, drift)
+
+
+def _kind(name: str) -> Any:
+    """Narrow a name to the literal that a substrate takes; the substrate checks it."""
+    return name
+
+
+def _draw_bright(rng: np.random.Generator) -> dict[str, float]:
+    beam = rng.uniform(0.55, 0.8)
+    return {
+        "beam": beam,
+        "holder": beam * rng.uniform(0.8, 1.1),
+        "pusher": rng.uniform(0.4, 0.7),
+        "ground": rng.uniform(0.1, 0.28),
+        "rim": rng.uniform(0.05, 0.18),
+    }
+
+
+def _draw_dark(rng: np.random.Generator) -> dict[str, float]:
+    """A light element on a heavy one: the rim of a dark beam is weak, or it would outshine the ground."""
+    beam = rng.uniform(0.06, 0.16)
+    return {
+        "beam": beam,
+        "holder": beam * rng.uniform(0.9, 1.5),
+        "pusher": rng.uniform(0.1, 0.3),
+        "ground": rng.uniform(0.55, 0.7),
+        "rim": rng.uniform(0.0, 0.06),
+    }

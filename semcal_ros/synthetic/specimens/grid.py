@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, check_positive
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.synthetic.specimens.thresholds import (
+from semcal_ros.synthetic.thresholds import (
     CURVATURE_MAX,
     FAULT_MAX,
     SQUARE_MAX,

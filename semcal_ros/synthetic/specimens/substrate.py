@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import did_you_mean
-from semcal_ros.synthetic.specimens.gold import GoldOnCarbon
-from semcal_ros.synthetic.specimens.periodic_tile import build_pyramid, sample_pyramid
-from semcal_ros.synthetic.specimens.thresholds import (
+from semcal_ros.synthetic.specimens.gold import GoldOnCarbon, build_pyramid, sample_pyramid
+from semcal_ros.synthetic.thresholds import (
     FIBRE_ELONGATION,
     FIBRE_LAYERS,
     FINER_RMS,

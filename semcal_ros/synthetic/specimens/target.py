@@ -28,7 +28,7 @@ from semcal_ros.applications.servoing.thresholds import MARKER_BITS, MARKER_SIDE
 from semcal_ros.core.arrays import Array, Image
 from semcal_ros.synthetic.specimens.cantilever import NO_CHARGING, Charging
 from semcal_ros.synthetic.specimens.substrate import SUBSTRATES, Substrate
-from semcal_ros.synthetic.specimens.thresholds import BIT_TEXELS
+from semcal_ros.synthetic.thresholds import BIT_TEXELS
 
 _CELL = round(MARKER_BITS * BIT_TEXELS / MARKER_SIDE)
 

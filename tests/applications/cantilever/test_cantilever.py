@@ -46,8 +46,11 @@ from semcal_ros.applications.cantilever.undeformed import fit_base_edge
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import Detector, Drift, preset
-from semcal_ros.synthetic.specimens.cantilever import CantileverScene, cantilever_plan
-from semcal_ros.synthetic.specimens.cantilever_random import random_cantilever
+from semcal_ros.synthetic.specimens.cantilever import (
+    CantileverScene,
+    cantilever_plan,
+    random_cantilever,
+)
 
 LENGTH = 35e-6
 DRIFT = Drift(velocity_m_s=(6e-9, -4e-9), settling_m=(60e-9, 90e-9), wander_m=10e-9, seed=4)

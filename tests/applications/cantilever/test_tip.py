@@ -26,9 +26,11 @@ from semcal_ros.applications.cantilever.finding import find_strip
 from semcal_ros.applications.cantilever.series import SeriesSettings, measure_series
 from semcal_ros.applications.cantilever.tip import find_apex, fit_tip
 from semcal_ros.synthetic import Detector, preset
-from semcal_ros.synthetic.specimens.cantilever import BeamTip, CantileverScene, cantilever_plan
-from semcal_ros.synthetic.specimens.cantilever_random import (
+from semcal_ros.synthetic.specimens.cantilever import (
     TIPS,
+    BeamTip,
+    CantileverScene,
+    cantilever_plan,
     make_tip,
     random_cantilever,
 )

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.applications.reconstruction import fit_sphere, triangulate_cloud
-from semcal_ros.applications.reconstruction.moving_least_squares import fit_local_surface
+from semcal_ros.applications.reconstruction.surface import fit_local_surface
 from semcal_ros.core.errors import StructureError
 
 RADIUS_M = 450e-9

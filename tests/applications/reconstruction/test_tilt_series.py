@@ -21,9 +21,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates, spline_filter
 
-from semcal_ros.applications.reconstruction import tilt_pair
-from semcal_ros.applications.reconstruction.tilt_pair import find_tilt_geometry
-from semcal_ros.applications.reconstruction.tilt_series import HeightMap, measure_heights
+from semcal_ros.applications.reconstruction import tilt_series
+from semcal_ros.applications.reconstruction.tilt_series import (
+    HeightMap,
+    find_tilt_geometry,
+    measure_heights,
+)
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError, StructureError
 
@@ -198,7 +201,7 @@ def test_the_axis_is_within_its_uncertainty() -> None:
 def test_a_false_match_on_its_epipolar_line_does_not_turn_the_axis(
     scene: tuple[list[Array], Array], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    images, match = scene[0], tilt_pair._match_features
+    images, match = scene[0], tilt_series._match_features
 
     def with_a_false_one(first: Array, second: Array) -> tuple[Array, Array]:
         one, two = match(first, second)
@@ -208,7 +211,7 @@ def test_a_false_match_on_its_epipolar_line_does_not_turn_the_axis(
         return np.vstack([one, one[:1]]), np.vstack([two, wrong])
 
     plain = find_tilt_geometry(images[1], images[2], near_axis_rad=0.0)
-    monkeypatch.setattr(tilt_pair, "_match_features", with_a_false_one)
+    monkeypatch.setattr(tilt_series, "_match_features", with_a_false_one)
     found = find_tilt_geometry(images[1], images[2], near_axis_rad=0.0)
     assert len(found.first) < found.matches
     shifts = np.linalg.norm(found.second - found.first, axis=1)

@@ -29,7 +29,7 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_distortion import Raster
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 MICROSCOPE = preset("jsm820")
 GS = np.array([200.0, 800.0])

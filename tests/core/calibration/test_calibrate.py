@@ -30,7 +30,7 @@ from semcal_ros.core.calibration.options import CalibrationOptions, MethodOption
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 from tests.helpers.long_tests import long_but
 

@@ -27,7 +27,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.calibrations import calibrated
 
 pytestmark = pytest.mark.slow

@@ -26,7 +26,7 @@ from semcal_ros.core.calibration.paper.discrete import DiscreteFit, find_distort
 from semcal_ros.core.calibration.paper.pda import ode_weights, pda_functions
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 BARREL = ScanCamera(
     500.0, 2.1e6, 1.0, 0.0, 255.5, 255.5, 50.0, 0.01, 0.0, 290.0, 240.0, 256.0, 512, 512

@@ -25,7 +25,7 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 
 def _view(n, rng):

@@ -29,7 +29,7 @@ from semcal_ros.core.calibration.judgement.thresholds import PLANNED_DIRECTIONS_
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.calibration.views import FoundView
-from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
+from semcal_ros.core.camera.uncertainty import worst_pixel_size
 from semcal_ros.core.corners import LatticeDetection, find_lattice
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.workflows.calibrate import RecordingCalibration, calibrate_found

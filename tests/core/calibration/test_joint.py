@@ -38,7 +38,7 @@ from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.start import measure_misfit_px
 from semcal_ros.core.camera.calibration_model import design_matrix, stack_coefficients
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 JSM = preset("jsm820")
 MAGNIFICATIONS = [100.0, 400.0, 1500.0, 5000.0, 10000.0]

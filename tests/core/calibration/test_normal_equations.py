@@ -53,8 +53,7 @@ from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices
 from semcal_ros.core.camera.calibration_model import stack_coefficients
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
-from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
+from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, grid_views, stage_views
 from tests.helpers.calibrations import calibrated
 
 MICROSCOPE = preset("strong_perspective")

@@ -25,7 +25,7 @@ from semcal_ros.core.calibration.judgement.update import update_calibration
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
-from semcal_ros.core.camera.provenance import Provenance
+from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import InvalidValueError
 from tests.core.calibration.test_check import AXIS, SEM, simulated
 

@@ -24,7 +24,7 @@ from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import views_from_detections
-from tests.helpers.corner_boards import seen_photograph
+from tests.helpers.grids import seen_photograph
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

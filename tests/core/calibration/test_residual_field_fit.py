@@ -26,8 +26,8 @@ from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
 from semcal_ros.synthetic.microscope import Exponential, Residual
+from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
 
 pytestmark = pytest.mark.slow

@@ -26,7 +26,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.grid_views import grid_views
+from semcal_ros.synthetic.stage import grid_views
 
 JSM = preset("jsm820")
 MAGNIFICATIONS = (250.0, 500.0, 1000.0, 2000.0, 4000.0)

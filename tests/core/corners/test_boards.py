@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import LatticeDetection
-from tests.helpers.corner_boards import Board, detected, position_bound
+from tests.helpers.grids import Board, detected, position_bound
 
 
 @lru_cache(maxsize=64)

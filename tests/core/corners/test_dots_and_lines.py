@@ -30,10 +30,9 @@ from semcal_ros.core.corners.dots_and_lines import (
     grow_at_scale,
     refine_cells,
 )
-from semcal_ros.core.corners.saddle import prepare_image, screen_image
+from semcal_ros.core.corners.lattice import prepare_image, screen_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
-from tests.helpers.corner_boards import Board, detected, rejected
-from tests.helpers.dot_grids import PatternBoard
+from tests.helpers.grids import Board, PatternBoard, detected, rejected
 
 TILTED = {"tilt_deg": 40.0, "axis_deg": 30.0, "perspective": 0.3, "distortion": 0.05}
 

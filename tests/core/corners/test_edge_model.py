@@ -21,9 +21,9 @@ import pytest
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.corners import edge_model
+from semcal_ros.core.corners.corner_fit import Learnt, learn, loose_prior
+from semcal_ros.core.corners.edge_model import PixelWindows, gather_windows
 from semcal_ros.core.corners.local_map import fit_local_maps
-from semcal_ros.core.corners.priors import Learnt, learn, loose_prior
-from semcal_ros.core.corners.window import PixelWindows, gather_windows
 
 AXES = np.array([[[14.0, 3.0], [-4.0, 11.0]], [[30.0, -5.0], [6.0, 33.0]]])
 BEND = np.array([[[0.4, -0.2], [0.1, 0.3]], [[-0.3, 0.5], [0.6, -0.1]]])

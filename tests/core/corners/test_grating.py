@@ -22,8 +22,7 @@ import pytest
 
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import Rejection
-from tests.helpers.corner_boards import Board
-from tests.helpers.dot_grids import PatternBoard
+from tests.helpers.grids import Board, PatternBoard
 
 
 def found_in(board: PatternBoard, seed: int = 1) -> LatticeDetection:

@@ -18,8 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semcal_ros.core.corners.lattice import grow_best_lattice
-from semcal_ros.core.corners.saddle import SaddlePoints
+from semcal_ros.core.corners.lattice import SaddlePoints, grow_best_lattice
 
 SPACING_PX = 30.0
 

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from tests.helpers.corner_boards import detected
+from tests.helpers.grids import detected
 
 pytestmark = pytest.mark.slow
 

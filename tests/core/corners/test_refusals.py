@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import InvalidValueError, Rejection
-from tests.helpers.corner_boards import Board, detected, rejected
+from tests.helpers.grids import Board, detected, rejected
 
 
 def blobs(seed: int) -> NDArray[np.uint8]:

@@ -41,13 +41,7 @@ from semcal_ros.core.ladder.extend import (
     extend_calibration,
     find_unrest,
 )
-from semcal_ros.core.ladder.matching import (
-    LadderPicture,
-    Match,
-    Turns,
-    check_steps,
-    compare_turns,
-)
+from semcal_ros.core.ladder.matching import LadderPicture, Match, Turns, check_steps, compare_turns
 from semcal_ros.core.ladder.unknowns import (
     LadderSetup,
     LadderState,

@@ -26,7 +26,7 @@ import pytest
 
 from benchmarks.calibration.grains import Grains
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.camera.predicted_error import predict_aligned_sigma_px
+from semcal_ros.core.camera.uncertainty import predict_aligned_sigma_px
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
 from semcal_ros.core.ladder.matching import LadderPicture

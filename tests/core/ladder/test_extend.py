@@ -25,7 +25,7 @@ import pytest
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.camera.calibration_model import ScaleSigma
-from semcal_ros.core.camera.uncertainty_budget import budget_of_pixel_size
+from semcal_ros.core.camera.uncertainty import budget_of_pixel_size
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.adjustment import adjust
 from semcal_ros.core.ladder.extend import LadderResult, check_fit, extend_calibration

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.core.ladder.plan import plan_ladder
+from semcal_ros.core.ladder.acquisition import plan_ladder
 from semcal_ros.core.ladder.thresholds import STEP_MAX
 from tests.helpers.ladders import calibration_of, make_scope
 

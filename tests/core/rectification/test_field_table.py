@@ -26,8 +26,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.rectification.chebyshev_map import RawMap, SmoothMaps
-from semcal_ros.core.rectification.field_table import tabulate_field
+from semcal_ros.core.rectification.chebyshev_map import RawMap, SmoothMaps, tabulate_field
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.synthetic import preset
 

@@ -30,7 +30,7 @@ from examples.cantilever.figure_16a import (
     show_comparison,
     spread_nm,
 )
-from semcal_ros.files.bags.simulated import SIMULATED_START_NS
+from semcal_ros.files.bags.writer import SIMULATED_START_NS
 from semcal_ros.workflows.measure_cantilever import CANTILEVER_COLUMNS
 
 MAGNIFICATIONS = (6450.0, 7760.0, 8890.0)

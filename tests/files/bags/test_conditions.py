@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.conditions import CONDITIONS_TYPE, fill_conditions
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions, fill_conditions
 from semcal_ros.config.config import load_config
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.recordings import RecordedFiles, open_recording
-from semcal_ros.files.tiff.sem_image import Conditions
 from semcal_ros.workflows.provenance import describe_provenance
 
 CONFIG = load_config("generic")

@@ -31,7 +31,7 @@ from semcal_ros.core.errors import BagError, InvalidValueError, SemcalError
 from semcal_ros.core.rectification.line_phase import estimate_line_phase
 from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, open_recording
 from semcal_ros.files.video import open_video
-from tests.files.tiff.test_to_bag import write_tescan
+from tests.files.images.test_to_bag import write_tescan
 
 CONFIG = load_config("generic")
 RNG = np.random.default_rng(0)

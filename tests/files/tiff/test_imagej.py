@@ -25,12 +25,7 @@ import pytest
 import tifffile
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.read import (
-    read_page_settings,
-    read_sem_pages,
-    read_sem_settings,
-    read_sem_tiff,
-)
+from semcal_ros.files.tiff.read import read_page_settings, read_sem_pages, read_sem_tiff
 from tests.files.tiff.test_hitachi import hitachi_text
 from tests.files.tiff.test_tiff import fei_text, jeol_text
 from tests.helpers.sem_files import zeiss_text
@@ -140,7 +135,7 @@ def test_copy_of_32_bits_has_scale_and_conditions(tmp_path: Path, white_is_zero:
     # Whole numbers of 32 bits are no grey levels of a known range.
     tifffile.imwrite(tmp_path / "u.tif", PIXELS.astype(np.uint32), description="ImageJ=1.54f")
     with pytest.raises(TiffError, match=r"32 bits per sample.*Type > 16-bit"):
-        read_sem_settings(tmp_path / "u.tif")
+        read_page_settings(tmp_path / "u.tif")
 
 
 def test_text_that_does_not_fit_a_cropped_copy_is_left_out(tmp_path: Path) -> None:
@@ -167,7 +162,7 @@ def test_channels_are_detectors(tmp_path: Path) -> None:
     assert [page.detector for page in pages] == ["channel 1", "channel 2"] * 3
     assert np.array_equal(pages[3].image, 255 - PIXELS)
     assert read_sem_tiff(pages[0].path, page=3).settings == pages[3].settings
-    assert read_sem_settings(pages[0].path)[0] == pages[0].settings
+    assert read_page_settings(pages[0].path)[0][1] == pages[0].settings
     maker = write(tmp_path / "c.tif", "nm", 0.25, stack, axes="TCYX", Info=jeol_text())
     assert [own.detector for _, own, _ in read_page_settings(maker)][:2] == [
         "LED channel 1",

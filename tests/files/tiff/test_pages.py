@@ -25,12 +25,7 @@ import pytest
 import tifffile
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.read import (
-    read_page_settings,
-    read_sem_pages,
-    read_sem_settings,
-    read_sem_tiff,
-)
+from semcal_ros.files.tiff.read import read_page_settings, read_sem_pages, read_sem_tiff
 from tests.helpers.sem_files import zeiss_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
@@ -67,7 +62,6 @@ def test_all_pages_with_their_own_settings(tmp_path: Path, compression: str | No
     listed = read_page_settings(path)
     assert listed == tuple((page.page, page.settings, (32, 20)) for page in pages)
     assert len(pages) == 3
-    assert read_sem_settings(path) == (pages[0].settings, (32, 20))
 
 
 def test_later_pages_packed_by_lzw(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from hypothesis import strategies as st
 
 from semcal_ros.core.errors import TiffError
 from semcal_ros.files.tiff.olympus import olympus_settings
-from semcal_ros.files.tiff.read import read_sem_settings, read_sem_tiff
+from semcal_ros.files.tiff.read import read_page_settings, read_sem_tiff
 from tests.helpers.sem_files import zeiss_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
@@ -526,7 +526,7 @@ def test_damaged_files_never_raise_anything_but_tiff_errors(
 def test_truncated_pixels(tmp_path: Path) -> None:
     path = write_tagged(tmp_path / "z.tif", 34118, zeiss_text())
     path.write_bytes(path.read_bytes()[:-100])
-    read_sem_settings(path)
+    read_page_settings(path)
     with pytest.raises(TiffError, match="cannot be read"):
         read_sem_tiff(path)
 
@@ -581,7 +581,7 @@ def test_real_files_agree_with_the_truth_table(reference_data: Path, name: str, 
 def test_real_files_say_where_their_stage_was(
     reference_data: Path, name: str, tilt_deg: float | None, rotation_deg: float | None
 ) -> None:
-    settings, _ = read_sem_settings(reference_data / "real_sem" / name)
+    (_, settings, _), *_ = read_page_settings(reference_data / "real_sem" / name)
     for angle, expected in (
         (settings.stage_tilt_rad, tilt_deg),
         (settings.stage_rotation_rad, rotation_deg),

@@ -25,8 +25,7 @@ from pathlib import Path
 import pytest
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.common.command_line import CommandLine
-from semcal_ros.nodes.common.help import EXECUTABLES
+from semcal_ros.nodes.common.command_line import EXECUTABLES, CommandLine
 from tests.helpers.ros_process import running
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -102,7 +101,7 @@ def test_help_needs_no_ros_and_says_what_the_documentation_says() -> None:
 import importlib
 import rclpy
 rclpy.init = None
-from semcal_ros.nodes.common.help import EXECUTABLES
+from semcal_ros.nodes.common.command_line import EXECUTABLES
 from tests.helpers.ros_process import running
 for name in EXECUTABLES:
     assert importlib.import_module(f"semcal_ros.nodes.{name}").main(["--help"]) == 0

@@ -24,7 +24,12 @@ from typing import Any
 import pytest
 
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.nodes.common.parameters import CALIBRATION, ParameterDeclaration, Parameters
+from semcal_ros.nodes.common.parameters import (
+    CALIBRATION,
+    AllowedPaths,
+    ParameterDeclaration,
+    Parameters,
+)
 
 RATE = ParameterDeclaration("rate", 1.0, "Rate.", "Hz", 0.5, 10.0)
 COUNT = ParameterDeclaration("count", 3, "Count.", low=0, high=5)
@@ -161,3 +166,40 @@ def test_a_file_given_at_start_is_allowed_and_its_folder_too(tmp_path: Path) -> 
 def test_numbers_that_are_not_finite_are_refused_without_limits_too(value: float) -> None:
     with pytest.raises(InvalidValueError, match="a number"):
         ParameterDeclaration("offset", 0.0, "Offset.").convert(value)
+
+
+def test_only_what_really_lies_inside_is_allowed(tmp_path: Path) -> None:
+    inside = tmp_path / "inside"
+    (inside / "deep").mkdir(parents=True)
+    (tmp_path / "inside2").mkdir()
+    (inside / "door").symlink_to(tmp_path)
+    (tmp_path / "way_in").symlink_to(inside)
+    allowed = AllowedPaths(str(inside))
+    good_ones = (inside / "a", inside / "deep" / ".." / "a", tmp_path / "way_in" / "a", "a")
+    for good in good_ones:
+        assert allowed.resolve(str(good)) == inside / "a"
+    for bad in (
+        inside / ".." / "a",
+        inside / "door" / "a",
+        inside / "deep" / ".." / ".." / "inside2" / "a",
+        tmp_path / "inside2" / "a",
+        "../a",
+        "door/a",
+        "nul\0byte",
+    ):
+        with pytest.raises(InvalidValueError):
+            allowed.resolve(str(bad))
+
+
+def test_the_start_is_trusted_with_its_file_and_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    start = tmp_path / "start.yaml"
+    by_folder = AllowedPaths("", [str(start)])
+    assert by_folder.resolve(str(tmp_path / "other" / "a")) == tmp_path / "other" / "a"
+    # A directory of its own takes the place of that folder, not of the file.
+    by_directory = AllowedPaths(str(tmp_path / "other"), [str(start)])
+    assert by_directory.resolve(str(start)) == start
+    with pytest.raises(InvalidValueError, match="inside"):
+        by_directory.resolve(str(tmp_path / "b.yaml"))
+    with pytest.raises(InvalidValueError, match="directory"):
+        AllowedPaths().resolve(str(start))

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,10 +25,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.config.config import load_config
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
+from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.frames.compressed import compressed_parameters
-from semcal_ros.nodes.frames.live_drift import DRIFT_PARAMETERS, DriftCorrection, FrameDrift
+from semcal_ros.nodes.frames.live_drift import (
+    DRIFT_PARAMETERS,
+    DriftCorrection,
+    FrameDrift,
+    LoadMonitor,
+)
 from semcal_ros.nodes.frames.outputs import ImageOutput
 from semcal_ros.nodes.frames.stream import StreamFrame, nominal_camera
 from tests.helpers.node_fakes import FakeParameters, fake_context
@@ -37,6 +45,16 @@ CONFIG = replace(load_config("virtual_sem"), scan=None)
 IMAGE = texture(size=128)
 CAMERA = nominal_camera(5000.0, 128, 128, CONFIG.display_width_m)
 S = 1_000_000_000
+
+MS = 1_000_000
+RASTER = """
+name: test
+display_width_m: 0.12
+image: {{stamp: {stamp}}}
+magnification: {{quantity: magnification}}
+{scan}
+"""
+SCAN = "scan: {frame_time_s: 0.25, averages: 4}"
 
 
 class Bench:
@@ -121,3 +139,79 @@ def test_a_reset_begins_at_zero(bench: Bench) -> None:
     drift = bench.drifts[-1]
     assert drift is not None
     np.testing.assert_array_equal(drift.estimate.drift_m, 0.0)
+
+
+def config(stamp: str = "start", scan: str = SCAN) -> MicroscopeConfig:
+    return parse_config(RASTER.format(stamp=stamp, scan=scan))
+
+
+def run(load: LoadMonitor, frames: int, interval_s: float, cost_s: float) -> list[bool]:
+    states = []
+    for _ in range(frames):
+        load.add_interval(interval_s)
+        load.add_cost(cost_s)
+        states.append(load.keeps_up)
+    return states
+
+
+def test_a_slow_stream_is_measured_frame_by_frame() -> None:
+    assert all(run(LoadMonitor(), 50, 0.5, 0.02))
+
+
+def test_a_fast_stream_is_not_waited_for_and_comes_back_with_room_to_spare() -> None:
+    load = LoadMonitor()
+    assert not run(load, 50, 0.005, 0.01)[-1]
+    # Just enough time would make it go to and fro.
+    assert not run(load, 200, 0.020, 0.01)[-1]
+    assert run(load, 200, 0.030, 0.01)[-1]
+    assert run(load, 200, 0.020, 0.01)[-1]
+
+
+def test_one_hiccup_changes_nothing() -> None:
+    load = LoadMonitor()
+    run(load, 50, 0.1, 0.02)
+    load.add_cost(0.3)
+    assert load.keeps_up
+    assert math.isnan(LoadMonitor().cost_s)
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_times_that_cannot_be_are_refused(value: float) -> None:
+    with pytest.raises(InvalidValueError):
+        LoadMonitor().add_interval(value)
+    with pytest.raises(InvalidValueError):
+        LoadMonitor().add_cost(value)
+
+
+@pytest.mark.parametrize(("stamp", "start_ms"), [("start", 0), ("centre", -500), ("end", -1000)])
+def test_with_stamps_the_scan_is_where_the_stamp_says(stamp: str, start_ms: int) -> None:
+    # Four passes of 0.25 s; one per cent of the second at either end does not count.
+    interval = scan_interval_ns(5000 * MS, None, config(stamp))
+    assert interval == ((5000 + start_ms + 10) * MS, (5000 + start_ms + 990) * MS)
+
+
+def test_with_publication_times_the_last_moments_belong_to_the_frame() -> None:
+    # Published when it is complete: a magnification 20 ms before is announced with it.
+    assert scan_interval_ns(0, 1010 * MS, config()) == (10 * MS, 980 * MS)
+    # Published before it can be complete.
+    assert scan_interval_ns(0, 500 * MS, config()) == (5 * MS, 480 * MS)
+    # Without raster timing it was scanned between its stamp and its publication.
+    assert scan_interval_ns(0, 200 * MS, config(scan="")) == (2 * MS, 180 * MS)
+
+
+def test_nothing_is_known_of_a_stamp_of_another_clock() -> None:
+    replayed_ns = 50_000_000 * 1000 * MS
+    assert scan_interval_ns(0, replayed_ns, config()) is None
+    assert scan_interval_ns(replayed_ns, 0, config()) is None
+    assert scan_interval_ns(0, None, config(scan="")) is None
+    # Published at its stamp, as recordings are: nothing came before.
+    assert scan_interval_ns(0, 0, config()) is None
+
+
+def test_values_that_began_within_an_interval() -> None:
+    hold = ZeroOrderHold[float]()
+    for stamp, value in ((10, 1.0), (20, 2.0), (30, 3.0)):
+        hold.insert(stamp, value)
+    assert hold.between(10, 30) == [2.0, 3.0]
+    assert hold.between(0, 9) == []
+    assert hold.between(30, 99) == []

@@ -175,9 +175,9 @@ def test_a_microscope_that_says_nothing_after_its_restart_is_believed_again_afte
     bench.receive(1.1)
     now_s = time.monotonic()
     # The latched value is offered once more after 3 s.
-    monkeypatch.setattr("semcal_ros.nodes.frames.magnification.time.monotonic", lambda: now_s + 3.5)
+    monkeypatch.setattr("semcal_ros.nodes.frames.held_values.time.monotonic", lambda: now_s + 3.5)
     bench.receive(1.2)
-    monkeypatch.setattr("semcal_ros.nodes.frames.magnification.time.monotonic", lambda: now_s + 4.5)
+    monkeypatch.setattr("semcal_ros.nodes.frames.held_values.time.monotonic", lambda: now_s + 4.5)
     bench.receive(1.3)
     assert [frame.magnification for frame in bench.frames] == [1000.0, None, None, 1000.0]
 

@@ -36,31 +36,32 @@ from semcal_ros.core.calibration.judgement.findings import (
 from semcal_ros.core.calibration.method_fit import Finding, rank_findings
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, CalibrationModel
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.predicted_error import (
+from semcal_ros.core.camera.residual_field import zero_field
+from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty import (
     make_field_lattice,
     predict_aligned_sigma_px,
     predict_shape_sigma_px,
 )
-from semcal_ros.core.camera.residual_field import zero_field
-from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.report.calibration.error_figures import plot_residual_field, plot_rms
-from semcal_ros.report.calibration.geometry import (
-    compute_displacements,
-    compute_rms_without_distortion,
-    remove_residual_field,
+from semcal_ros.report.calibration.error_figures import (
+    plot_predicted_errors,
+    plot_residual_field,
+    plot_rms,
 )
 from semcal_ros.report.calibration.numbers import (
     collect_warnings,
+    compute_displacements,
     compute_fitted_inner_px,
     compute_held_out_px,
     compute_median_px,
+    compute_rms_without_distortion,
+    remove_residual_field,
     tabulate_beside_paper,
     tabulate_cameras,
     tabulate_magnifications,
 )
 from semcal_ros.report.calibration.parameter_figures import compute_focal_length_px, plot_parameters
-from semcal_ros.report.calibration.uncertainty_figures import plot_predicted_errors
-from semcal_ros.report.html.text import (
+from semcal_ros.report.html.page import (
     format_length,
     format_magnification,
     format_px,

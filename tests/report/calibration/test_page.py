@@ -35,33 +35,24 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import FoundView, GridView
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
-from semcal_ros.files.tiff.values import quantity
+from semcal_ros.files.images.metadata import quantity
 from semcal_ros.report import write_calibration_report
-from semcal_ros.report.calibration.examples import (
-    choose_examples,
-    overlay_corners,
-    show_rejected,
-)
-from semcal_ros.report.calibration.geometry import compute_rms_without_distortion
 from semcal_ros.report.calibration.numbers import (
     compute_fitted_inner_px,
     compute_held_out_px,
+    compute_rms_without_distortion,
     tabulate_beside_paper,
     tabulate_magnifications,
 )
-from semcal_ros.report.calibration.worst_views import choose_worst_views
-from semcal_ros.report.html import encode
-from semcal_ros.report.html.page import write_page
-from semcal_ros.report.html.text import format_px
-from tests.helpers.report_samples import (
-    DISPLAY_M,
-    HOSTILE,
-    SIZE,
-    Page,
-    found_of,
-    grid_view,
-    unused,
+from semcal_ros.report.calibration.view_pictures import (
+    choose_examples,
+    choose_worst_views,
+    overlay_corners,
+    show_rejected,
 )
+from semcal_ros.report.html import encode
+from semcal_ros.report.html.page import format_px, write_page
+from tests.helpers.report_samples import DISPLAY_M, HOSTILE, SIZE, Page, found_of, grid_view, unused
 
 pytestmark = pytest.mark.slow
 

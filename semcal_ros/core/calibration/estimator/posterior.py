@@ -78,7 +78,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
 )
 from semcal_ros.core.camera.calibration_model import columns_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.fit_record import Certificate
+from semcal_ros.core.camera.records import Certificate
 from semcal_ros.core.errors import UnusableCalibrationError
 
 

@@ -34,8 +34,8 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     DIFFERENT_SIGMAS,
 )
 from semcal_ros.core.camera.calibration_model import CalibrationModel
-from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.camera.uncertainty import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.errors import InvalidValueError
 
 

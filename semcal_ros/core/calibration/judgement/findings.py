@@ -41,7 +41,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
 )
 from semcal_ros.core.calibration.method_fit import Finding, rank_findings
 from semcal_ros.core.calibration.views import FoundView, RejectedView, show_lines
-from semcal_ros.core.camera.predicted_error import make_field_lattice, predict_shape_sigma_px
+from semcal_ros.core.camera.uncertainty import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted

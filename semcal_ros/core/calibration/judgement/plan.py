@@ -56,7 +56,7 @@ from semcal_ros.core.camera.calibration_model import (
     pixel_size_gradient,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.camera.uncertainty_budget import worst_pixel_size
+from semcal_ros.core.camera.uncertainty import worst_pixel_size
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.wording import rounded_magnification
 

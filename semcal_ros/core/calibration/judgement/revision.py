@@ -61,8 +61,8 @@ from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
     design_matrix,
 )
-from semcal_ros.core.camera.fit_record import FitRecord
 from semcal_ros.core.camera.projection import ALL_NAMES
+from semcal_ros.core.camera.records import FitRecord
 from semcal_ros.core.errors import CalibrationError
 
 #: Parameters that may have changed since the calibration, by the same amount at all magnifications; that of the
