@@ -77,7 +77,7 @@ from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
 from semcal_ros.core.drift.own_motion import BodyFrame, OwnMotion, OwnMotionEstimator
 from semcal_ros.core.drift.similarity import (
     SimilarityMatch,
-    SimilarityTracker,
+    SimilarityState,
     constrain_registration,
     turn_drift,
 )
@@ -188,9 +188,7 @@ class _Track:
     of_unseen: Array = field(default_factory=lambda: np.zeros((2, 2)))
     blind: set[int] = field(default_factory=set)
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
-    similarity: SimilarityTracker = field(
-        default_factory=lambda: SimilarityTracker(keeps_history=False)
-    )
+    similarity: SimilarityState = field(default_factory=lambda: SimilarityState(False))
 
     def unseen_covariance(self, px_from_unit: Array) -> Array:
         """(2, 2) covariance of the drift along lines, which has only been predicted since they alone are seen."""
@@ -204,7 +202,7 @@ class _Track:
 
     def inflate(self, inflation: Inflate) -> None:
         """Let the covariance grow, also that of what is only predicted since lines alone are seen."""
-        self.filter.apply(inflation)
+        self.filter = self.filter.apply(inflation)
         if self.unseen is not None:
             self.unseen = inflation(self.unseen, self.filter.process_noise)
 
@@ -218,8 +216,8 @@ class _Track:
 
     def forget(self, key: int) -> None:
         """Remove a keyframe from what is estimated."""
-        self.filter.apply(Marginalise(key))
-        self.similarity.forget(key)
+        self.filter = self.filter.apply(Marginalise(key))
+        self.similarity = self.similarity.forget(key)
 
 
 @dataclass(frozen=True)
@@ -384,12 +382,12 @@ class DriftTracker:
                 update = self._follow(track, frame)
         if track.seen < _FIRST_LOOKS or (track.seen + 1) % _LOOK_EVERY == 0:
             track.before = pixels.copy()
-        track.filter.mark_frame()
-        track.similarity.mark_frame(track.filter.state.time_s)
+        track.filter = track.filter.mark_frame()
+        track.similarity = track.similarity.mark_frame(track.filter.state.time_s)
         track.camera, track.time_s = fitted, centre_s
         track.of_unseen = track.unseen_covariance(frame.px_from_unit)
         if self._history is not None:
-            self._history.add(update, fitted)
+            self._history.add(update, fitted, track.filter, track.similarity)
         return update
 
     def _look_for_overlay(self, track: _Track, frame: ScanFrame) -> None:
@@ -429,7 +427,7 @@ class DriftTracker:
                     # What stays pulls to where it is: by its part of the structure.
                     pulled_px = share_of_gradients(pixels, found.stays) * moved_px
                     moved = np.linalg.solve(frame.px_from_unit, pulled_px)
-                    track.filter.widen_measurements(np.outer(moved, moved))
+                    track.filter = track.filter.widen_measurements(np.outer(moved, moved))
                     self._clean_keyframes(track)
         elif fixed.mask is not None and fixed.mask.shape != pixels.shape[:2]:
             fixed.mask = None
@@ -462,10 +460,8 @@ class DriftTracker:
         settings = self.settings
         start = initial_state(centre_s, centre_covariance(frame.camera))
         kept = self._history is not None
-        drift_filter = DriftFilter(start, settings.acceleration_psd, history=kept)
-        similarity = SimilarityTracker(keeps_history=kept)
-        if self._history is not None:
-            self._history.begin(drift_filter, similarity)
+        drift_filter = DriftFilter.begin(start, settings.acceleration_psd, keeps_history=kept)
+        similarity = SimilarityState(keeps_history=kept)
         store = KeyframeStore(
             settings.registration, settings.max_keyframe_bytes, settings.max_keyframes
         )
@@ -487,8 +483,8 @@ class DriftTracker:
         if reference.defect:
             return Rejection(MatchFailure.UNUSABLE_IMAGE, reference.defect)
         key, forgotten = track.store.add(keyframe, reference)
-        track.filter.add_keyframe(key, removed, frame.acceleration_term_s2)
-        track.similarity.add_keyframe(key, turn, time_s)
+        track.filter = track.filter.add_keyframe(key, removed, frame.acceleration_term_s2)
+        track.similarity = track.similarity.add_keyframe(key, turn, time_s)
         if track.unseen is not None:
             track.blind.add(key)
         for old in forgotten:
@@ -520,10 +516,12 @@ class DriftTracker:
             # of the velocity.
             unit_from_px = np.linalg.inv(frame.px_from_unit)
             step = self.settings.first_step_px * float(np.linalg.norm(unit_from_px, 2))
-            drift_filter.set_motion_prior(step / dt, (_VELOCITY_CHANGE * step) ** 2 / dt**3, dt)
+            drift_filter = drift_filter.set_motion_prior(
+                step / dt, (_VELOCITY_CHANGE * step) ** 2 / dt**3, dt
+            )
         speed = float(np.hypot(*drift_filter.state.velocity))
-        drift_filter.apply(Predict(centre_s))
-        track.similarity.predict(centre_s)
+        track.filter = drift_filter = drift_filter.apply(Predict(centre_s))
+        track.similarity = track.similarity.predict(centre_s)
         if 0.0 < _PAUSE * drift_filter.process_noise.time_constant_s < dt:
             track.inflate(inflate_after_pause(speed, dt))
 
@@ -610,7 +608,9 @@ class DriftTracker:
             return before
         if isinstance(before, _Match):
             time_s, last_s = track.filter.state.time_s, track.time_s
-            suggested = similarity.confirm_turn(before.registration, turn, frame, time_s, last_s)
+            track.similarity, suggested = similarity.confirm_turn(
+                before.registration, turn, frame, time_s, last_s
+            )
         else:
             suggested = similarity.suggest_turn(key, before.registration, turn, frame)
         if suggested is None:
@@ -618,15 +618,15 @@ class DriftTracker:
         if similarity.is_active:
             match = self._match_once(track, frame, candidate, motion, suggested)
             return match if isinstance(match, _Match) else before
-        mean = track.store[key]
-        similarity.activate(key, suggested, track.filter.state.time_s)
+        mean, quiet = track.store[key], track.similarity
+        track.similarity = track.similarity.activate(key, suggested, track.filter.state.time_s)
         self._forget_mean(track, key)
         match = self._match_once(track, frame, candidate, motion, suggested)
         if isinstance(match, _RejectedMatch):
-            similarity.deactivate()
+            track.similarity = quiet
             track.store.replace(key, mean)
             return before
-        for other in similarity.keys:
+        for other in track.similarity.keys:
             if other != key:
                 self._forget_mean(track, other)
         return match
@@ -672,7 +672,7 @@ class DriftTracker:
                 track.store.replace(k, mean)
             return match
         pulled = np.linalg.solve(frame.px_from_unit, pulled_px)
-        track.filter.widen_measurements(np.outer(pulled, pulled))
+        track.filter = track.filter.widen_measurements(np.outer(pulled, pulled))
         return again
 
     def _forget_mean(self, track: _Track, key: int) -> None:
@@ -713,7 +713,7 @@ class DriftTracker:
             return _RejectedMatch(registration.rejection, registration)
         keyframe = store[key]
         averaged = np.inf if candidate.rescaled else float(store.averaged(key))
-        similarity = track.similarity.match(
+        track.similarity, similarity = track.similarity.match(
             key, registration, turn, frame, averaged, measures=not candidate.rescaled
         )
         measured = registration
@@ -721,7 +721,7 @@ class DriftTracker:
             measured = constrain_registration(registration, similarity, appears, frame)
         measure = make_measurement(key, keyframe.frame, frame, measured, motion, averaged)
         if track.filter.pending == key:
-            track.filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
+            track.filter = track.filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
         return _Match(
             candidate,
             registration,
@@ -750,7 +750,7 @@ class DriftTracker:
             return False
         self._remake_keyframe(track, candidate.key, keyframe.frame, removed)
         term_s2 = keyframe.frame.acceleration_term_s2
-        track.filter.apply(CorrectShear(candidate.key, remaining, term_s2))
+        track.filter = track.filter.apply(CorrectShear(candidate.key, remaining, term_s2))
         return True
 
     # -- measuring --------------------------------------------------------------------------------
@@ -789,16 +789,16 @@ class DriftTracker:
             disputed = np.outer(deviation, deviation)
             return _RejectedMatch(judged, match.registration, disputed)
         if sees_again:
-            drift_filter.apply(anywhere)
+            track.filter = drift_filter.apply(anywhere)
             track.see_again()
         if judged is not None:
             track.inflate(judged)
         if along is not None:
             track.along = along
             if track.unseen is None:
-                track.unseen = drift_filter.state.without_keyframes()
+                track.unseen = track.filter.state.without_keyframes()
         since_s = state.time_s - track.time_s
-        track.similarity.use(match.similarity, since_s)
+        track.similarity = track.similarity.use(match.similarity, since_s)
         if outcome.shear_nis > GATE:
             measure = measure.without_shear()
         if match.candidate.ratio > _SMALL_ZOOM:
@@ -806,10 +806,10 @@ class DriftTracker:
         elif match.candidate.rescaled:
             # A zoom in small steps would make a long chain of keyframes.
             measure = zoomed
-        drift_filter.update(measure)
         # Of two directions, one was the predicted one.
         nis = outcome.nis if along is None else 2.0 * outcome.nis
-        drift_filter.adapt_process_noise(nis, measure.covariance[:2, :2], since_s)
+        updated = track.filter.update(measure)
+        track.filter = updated.adapt_process_noise(nis, measure.covariance[:2, :2], since_s)
         if not match.candidate.rescaled:
             self._look_for_flicker(track, frame, match)
         return None
@@ -824,7 +824,7 @@ class DriftTracker:
         frame_s = 1.0 if frame.timing is None else frame.timing.frame_time_s
         flicker = variance_px2 * unit**2 / np.array([1.0, 1.0, frame_s**2, frame_s**2])
         if not np.array_equal(flicker, track.filter.process_noise.flicker):
-            track.filter.set_flicker(flicker)
+            track.filter = track.filter.set_flicker(flicker)
 
     def _change_scale(
         self, track: _Track, frame: ScanFrame, match: _Match, measure: Measure
@@ -1006,11 +1006,13 @@ def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noi
         frame, match.removed, match.image, match.region, state.time_s, turn, match.fixed
     )
     key, forgotten = track.store.add(keyframe)
-    track.filter.apply(clone_keyframe(key, state, measure, match.removed, noise))
+    track.filter = track.filter.apply(clone_keyframe(key, state, measure, match.removed, noise))
     if match.candidate.rescaled:
-        track.similarity.add_keyframe(key, turn, state.time_s)
+        track.similarity = track.similarity.add_keyframe(key, turn, state.time_s)
     else:
-        track.similarity.clone_keyframe(key, measure.key, match.registration, turn, state.time_s)
+        track.similarity = track.similarity.clone_keyframe(
+            key, measure.key, match.registration, turn, state.time_s
+        )
     if track.unseen is not None:
         track.blind.add(key)
     for old in forgotten:
