@@ -30,7 +30,7 @@ columns, in which what moves whole lines cancels.
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -64,45 +64,52 @@ _OF_MODE = 0.9
 _OF_MEAN, _OF_SHEAR = 3.0, 7.8
 
 
+@dataclass(frozen=True)
 class FlickerEstimator:
-    """Density of the 1/f noise of a stream, from its latest registrations."""
+    """Density of the 1/f noise of a stream, from its latest registrations. Each makes another one.
 
-    def __init__(self) -> None:
-        self._powers: deque[Array] = deque(maxlen=_KEPT)
-        self._count, self._due = 0, 1
+    Attributes
+    ----------
+    powers
+        (2, modes, 2) of each of the latest: of x and y, of the whole and of the noise of the images.
+    count
+        Number of registrations.
+    due
+        Their number at which the density is estimated the next time.
+    """
 
-    @property
-    def count(self) -> int:
-        """Number of registrations."""
-        return self._count
+    powers: tuple[Array, ...] = ()
+    count: int = 0
+    due: int = 1
 
-    def add(self, registration: Registration, averaged: float, size: tuple[int, int]) -> bool:
+    def add(
+        self, registration: Registration, averaged: float, size: tuple[int, int]
+    ) -> tuple[FlickerEstimator, bool]:
         """Add a registration against the mean of ``averaged`` frames of ``size`` (width, height); whether the
         next estimate is due.
         """
         if np.any(np.abs(registration.shift_px) > _MAX_SHIFT * np.array(size)):
-            return False
+            return self, False
         power = registration.alignment.row_power(int(_MODES[-1]) + 1)
         if power is None:
-            return False
+            return self, False
         # The keyframe is bent, too.
         known = np.full((2, len(_MODES), 2), np.nan)
         modes = power.shape[1] - int(_MODES[0])
         known[:, :modes] = power[:, _MODES[:modes]] / (1.0 + 1.0 / averaged)
-        self._powers.append(known)
-        self._count += 1
-        if self._count < self._due:
-            return False
-        self._due = min(int(np.ceil(_GROWTH * self._count)), self._count + _KEPT)
-        return True
+        count, due = self.count + 1, self.due
+        if count >= due:
+            due = min(int(np.ceil(_GROWTH * count)), count + _KEPT)
+        after = FlickerEstimator((*self.powers, known)[-_KEPT:], count, due)
+        return after, due > self.due
 
     def variance_px2(self) -> Array:
         """(4,) variances of the shift of a frame (x, y) about that of its middle, and of its shear; zero
         where there is no 1/f noise to be seen.
         """
-        if not self._powers:
+        if not self.powers:
             return np.zeros(4)
-        powers = np.array(self._powers)
+        powers = np.array(self.powers)
         total = np.nanmean(powers, axis=(1, 2, 3))
         powers = powers[total <= _OUTLIER * np.median(total)]
         counts = np.count_nonzero(np.isfinite(powers[:, 0, :, 0]), axis=0).astype(np.float64)

@@ -41,6 +41,8 @@ _SHEAR_OF_SHIFT = 1e-3
 _DISTORTION_OF_SCALE = 1.0 / 3.0
 # The shear that a wrong velocity leaves in a frame is worth another registration from here on.
 _MAX_SHEAR_PX = 0.1
+#: Part of the image's height by which drift may shear it.
+MAX_SHEAR = 0.1
 # Part of the variance of a measured shear by which that of the keyframe differs from it.
 _SHEAR_COPY_NOISE = 0.01
 
@@ -53,6 +55,14 @@ def exceeds_tolerance(motion: Array, frame: ScanFrame) -> bool:
     shear_px = np.abs(frame.px_from_unit @ motion[:2]) * time_s
     bend_px = np.abs(frame.px_from_unit @ motion[2:]) * time_s**2 / 8.0
     return float(np.max(np.maximum(shear_px, bend_px))) > _MAX_SHEAR_PX
+
+
+def is_removable(motion: Array, frame: ScanFrame) -> bool:
+    """Whether a motion, of which the first two numbers are a velocity, can be that of a specimen during a frame."""
+    if frame.timing is None:
+        return True
+    shear_px = np.abs(frame.px_from_unit @ motion[:2]) * frame.timing.frame_time_s
+    return float(np.max(shear_px)) <= MAX_SHEAR * frame.size[1]
 
 
 def make_measurement(

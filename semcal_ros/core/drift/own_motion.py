@@ -22,7 +22,7 @@ How much of the ground is still among them is told by a second look, with a ring
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -120,66 +120,75 @@ class BodyFrame:
     time_s: float
 
 
+@dataclass(frozen=True)
 class OwnMotionEstimator:
-    """Measures the own motion of a body, from one frame to a later one again and again."""
+    """Measures the own motion of a body, from one frame to a later one again and again. Each frame makes another one.
 
-    def __init__(self) -> None:
-        self._base: BodyFrame | None = None
-        self._since = 0
-        self._rest = 0
-        self._failures = 0
-        self._guess: OwnMotion | None = None
-        self._latest: OwnMotion | None = None
+    Attributes
+    ----------
+    latest
+        The motion as it was measured last; None where it is not known, or nothing moves.
+    guess
+        Where to look the next time: as ``latest``, or a first measurement, whose start was searched for.
+    base
+        The frame from which it is measured next.
+    since
+        Number of frames since then.
+    rest
+        Number of frames to wait for the next one to measure from.
+    failures
+        Number of measurements in a row that failed.
+    """
 
-    def update(self, frame: BodyFrame | None) -> OwnMotion | None:
-        """The motion as it was measured last; None where it is not known, or nothing moves (``frame`` is None).
+    latest: OwnMotion | None = None
+    guess: OwnMotion | None = None
+    base: BodyFrame | None = None
+    since: int = 0
+    rest: int = 0
+    failures: int = 0
 
-        The first measurement, whose start was searched for, only tells where to look the next time.
-        """
+    def update(self, frame: BodyFrame | None) -> OwnMotionEstimator:
+        """The estimator after a frame; None where nothing moves."""
         if frame is None:
-            self._base = self._guess = self._latest = None
-            self._since = self._rest = self._failures = 0
-            return None
-        base = self._base
+            return OwnMotionEstimator()
+        base = self.base
         if base is None or not _are_comparable(base, frame):
+            waiting = replace(self, rest=self.rest - 1)
             if base is not None:
-                self._guess = self._latest = None
-            self._rest -= 1
-            if self._rest <= 0:
-                self._base, self._since = _keep(frame), 0
-            return self._latest
-        self._since += 1
+                waiting = replace(waiting, guess=None, latest=None)
+            if waiting.rest > 0:
+                return waiting
+            return replace(waiting, base=_keep(frame), since=0)
+        later = replace(self, since=self.since + 1)
         interval_s = frame.time_s - base.time_s
         moved_px = frame.px_from_unit @ (frame.drift - base.drift)
         expected_px = None
-        if self._guess is not None:
-            expected_px = interval_s * (frame.px_from_unit @ self._guess.velocity_m_s)
+        if self.guess is not None:
+            expected_px = interval_s * (frame.px_from_unit @ self.guess.velocity_m_s)
             is_near = float(np.hypot(*(expected_px - moved_px))) < _LEAST_APART_PX
-            if is_near and self._since < _MOST_FRAMES:
-                return self._latest
-        elif self._since not in _SEARCHES:
-            return None
+            if is_near and later.since < _MOST_FRAMES:
+                return later
+        elif later.since not in _SEARCHES:
+            return later
         found = measure_displacement(base, frame, moved_px, expected_px)
-        if found is None and expected_px is None and self._since < _SEARCHES[-1]:
-            # It may be a slow one.
-            return None
-        before, self._guess, self._latest = self._guess, None, None
-        if found is not None:
-            unit_from_px = np.linalg.inv(frame.px_from_unit) / interval_s
-            displacement, covariance = found
-            self._guess = OwnMotion(
-                unit_from_px @ displacement,
-                unit_from_px @ covariance @ unit_from_px.T,
-                base.time_s,
-                frame.time_s,
-            )
-            if before is not None and _is_confirmed(before, self._guess, interval_s, frame):
-                self._latest = self._guess
-        self._failures = self._failures + 1 if found is None else 0
-        self._base, self._rest = None, 0 if self._latest is None else _REST_FRAMES
         if found is None:
-            self._rest = min(_REST_FRAMES * 2**self._failures, _LONGEST_REST)
-        return self._latest
+            if expected_px is None and later.since < _SEARCHES[-1]:
+                # It may be a slow one.
+                return later
+            failures = self.failures + 1
+            rest = min(_REST_FRAMES * 2**failures, _LONGEST_REST)
+            return OwnMotionEstimator(since=later.since, rest=rest, failures=failures)
+        unit_from_px = np.linalg.inv(frame.px_from_unit) / interval_s
+        displacement, covariance = found
+        guess = OwnMotion(
+            unit_from_px @ displacement,
+            unit_from_px @ covariance @ unit_from_px.T,
+            base.time_s,
+            frame.time_s,
+        )
+        if self.guess is not None and _is_confirmed(self.guess, guess, interval_s, frame):
+            return OwnMotionEstimator(guess, guess, since=later.since, rest=_REST_FRAMES)
+        return OwnMotionEstimator(guess=guess, since=later.since)
 
 
 def _is_confirmed(before: OwnMotion, now: OwnMotion, interval_s: float, frame: BodyFrame) -> bool:

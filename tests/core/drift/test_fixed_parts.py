@@ -120,10 +120,10 @@ def test_contrast_of_a_mean_does_not_grow() -> None:
     tracker = DriftTracker()
     merged = sum(tracker.update(frame, float(k)).merged for k, frame in enumerate(frames))
     assert merged > 20
-    track = tracker._track
-    assert track is not None
-    assert track.store.current is not None
-    mean = track.store[track.store.current].mean
+    assert tracker.state is not None
+    keyframes = tracker.state.keyframes
+    assert keyframes.current is not None
+    mean = keyframes[keyframes.current].mean
     # Particles are the brightest per cent; those of all frames brought to the first one are the truth.
     rows, cols = np.mgrid[60:324, 60:324]
     brought = np.mean(
