@@ -19,7 +19,7 @@ A filter never changes: what happens to it makes another one, so that the one be
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from semcal_ros.core.drift.operations import (
     Predict,
 )
 from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.shared_sequence import SharedSequence
 from semcal_ros.core.drift.smoother import Event, Mark, estimate_process_noise, replay
 from semcal_ros.core.drift.state import DriftState
 
@@ -87,7 +88,7 @@ class DriftFilter:
         Whether the process noise follows the innovations.
     keeps_history
         Whether all events are kept, for a smoother.
-    events
+    log
         What has happened since the start, as long as it may have to be done again.
     measured
         Number of measurements.
@@ -100,7 +101,7 @@ class DriftFilter:
     process_noise: ProcessNoise
     adapts: bool
     keeps_history: bool
-    events: tuple[Event, ...] = ()
+    log: SharedSequence[Event] = field(default_factory=SharedSequence)
     measured: int = 0
     unmeasured: PendingKeyframe | None = None
 
@@ -123,6 +124,11 @@ class DriftFilter:
         return cls(start, start, process_noise, acceleration_psd is None, keeps_history)
 
     @property
+    def events(self) -> tuple[Event, ...]:
+        """What has happened, in order."""
+        return tuple(self.log)
+
+    @property
     def pending(self) -> int | None:
         """Number of the keyframe that nothing was registered against yet."""
         return None if self.unmeasured is None else self.unmeasured.operation.key
@@ -130,14 +136,14 @@ class DriftFilter:
     def apply(self, operation: Operation) -> DriftFilter:
         """The filter after an operation on its state."""
         state = operation(self.state, self.process_noise)
-        return replace(self, state=state, events=(*self.events, operation))
+        return replace(self, state=state, log=self.log.with_item(operation))
 
     def mark_frame(self) -> DriftFilter:
         """Note that the present state is that of a frame."""
         if self.keeps_history:
-            return replace(self, events=(*self.events, Mark()))
+            return replace(self, log=self.log.with_item(Mark()))
         if self.unmeasured is None and self.measured >= _ESTIMATE_AFTER[-1]:
-            return replace(self, events=())
+            return replace(self, log=SharedSequence())
         return self
 
     def add_keyframe(self, key: int, removed: Array, acceleration_term_s2: float) -> DriftFilter:
@@ -147,7 +153,7 @@ class DriftFilter:
         The arguments are those of :class:`~semcal_ros.core.drift.operations.AddKeyframe`.
         """
         operation = AddKeyframe(key, removed, acceleration_term_s2, np.zeros((4, 4)), 0.0)
-        pending = PendingKeyframe(operation, len(self.events), self.state)
+        pending = PendingKeyframe(operation, len(self.log), self.state)
         return replace(self.apply(operation), unmeasured=pending)
 
     def set_motion_prior(self, sigma: float, psd: float, interval_s: float) -> DriftFilter:
@@ -163,10 +169,11 @@ class DriftFilter:
         )
         variances = [0.0, sigma**2, process_noise.acceleration_variance]
         prior = Inflate(np.diag(np.repeat(variances, 2)))
+        events = self.events
         known = replace(
             self,
             process_noise=process_noise,
-            events=(*self.events[: pending.index], prior, *self.events[pending.index :]),
+            log=SharedSequence.of((*events[: pending.index], prior, *events[pending.index :])),
             unmeasured=replace(
                 pending, index=pending.index + 1, before=prior(pending.before, process_noise)
             ),
@@ -179,8 +186,9 @@ class DriftFilter:
         if pending is None:
             return self
         known = replace(pending.operation, noise=noise, scan_s=scan_s)
-        events = (*self.events[: pending.index], known, *self.events[pending.index + 1 :])
-        return replace(self, events=events)._replay_since_pending()
+        events = self.events
+        changed = (*events[: pending.index], known, *events[pending.index + 1 :])
+        return replace(self, log=SharedSequence.of(changed))._replay_since_pending()
 
     def _replay_since_pending(self) -> DriftFilter:
         """Apply again what happened since the pending keyframe: nothing but time has passed."""
@@ -197,7 +205,7 @@ class DriftFilter:
         updated = replace(
             self,
             state=measure(self.state, self.process_noise).state,
-            events=(*self.events, measure),
+            log=self.log.with_item(measure),
             unmeasured=None,
             measured=self.measured + 1,
         )
@@ -207,13 +215,14 @@ class DriftFilter:
 
     def _estimate_process_noise(self) -> DriftFilter:
         """Estimate the process noise from all measurements: the first guess is worth less than they are."""
-        times = [event.time_s for event in self.events if isinstance(event, Predict)]
+        events = self.events
+        times = [event.time_s for event in events if isinstance(event, Predict)]
         interval_s = float(np.median(np.diff([self.start.time_s, *times])))
         near = self.process_noise
         if interval_s > 0.0:
             near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
-        process_noise = estimate_process_noise(self.start, self.events, near, (1.0,))
-        state = replay(self.start, self.events, process_noise)
+        process_noise = estimate_process_noise(self.start, events, near, (1.0,))
+        state = replay(self.start, events, process_noise)
         return replace(self, process_noise=process_noise, state=state)
 
     def widen_measurements(self, covariance: Array) -> DriftFilter:
@@ -226,9 +235,13 @@ class DriftFilter:
             return self.apply(Inflate(both))
         events = tuple(
             event.widened(covariance) if isinstance(event, Measure | CloneKeyframe) else event
-            for event in self.events
+            for event in self.log
         )
-        return replace(self, events=events, state=replay(self.start, events, self.process_noise))
+        return replace(
+            self,
+            log=SharedSequence.of(events),
+            state=replay(self.start, events, self.process_noise),
+        )
 
     def set_flicker(self, flicker: Array) -> DriftFilter:
         """Set the variances (4,) of :attr:`.process_noise.ProcessNoise.flicker`."""

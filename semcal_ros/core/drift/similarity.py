@@ -49,6 +49,7 @@ from semcal_ros.core.drift.operations import (
     Transition,
 )
 from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.shared_sequence import SharedSequence
 from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import KEYFRAME_SIZE, MOTION_SIZE, DriftState, initial_state
 from semcal_ros.core.rectification.raw_positions import rotation_centre, similarity_matrix
@@ -194,7 +195,7 @@ class SimilarityState:
     keeps_history: bool
     filter: DriftFilter | None = None
     quiet: dict[int, QuietKeyframe] = field(default_factory=dict)
-    times: tuple[float, ...] = ()
+    times: SharedSequence[float] = field(default_factory=SharedSequence)
     suspected: tuple[float, Array] | None = None
     before_marks: int = 0
     was_outlier: bool = False
@@ -214,7 +215,7 @@ class SimilarityState:
         """Note that the present state is that of a frame."""
         if self.filter is not None:
             return replace(self, filter=self.filter.mark_frame())
-        return replace(self, times=(*self.times, time_s)) if self.keeps_history else self
+        return replace(self, times=self.times.with_item(time_s)) if self.keeps_history else self
 
     def add_keyframe(self, key: int, removed: Array, time_s: float) -> SimilarityState:
         """Note a keyframe that was not measured, from a frame without ``removed`` (2,)."""
