@@ -22,7 +22,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS, Candidate, KeyframeStore
+from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS, Candidate
 from semcal_ros.core.drift.measurement import (
     MAX_SHEAR,
     exceeds_tolerance,
@@ -215,11 +215,6 @@ def _prepare_reference(
     return replace(state, keyframes=store), reference
 
 
-def _with_prepared(store: KeyframeStore, other: KeyframeStore) -> KeyframeStore:
-    """The keyframes with the references of others."""
-    return replace(store, prepared=other.prepared, resampled=other.resampled)
-
-
 def _match_turned(
     setup: TrackerSetup,
     state: TrackerState,
@@ -250,8 +245,7 @@ def _match_turned(
         turned = forget_mean(setup, replace(state, similarity=active), key)
     turned, match = _register(setup, turned, frame, candidate, motion, suggested)
     if isinstance(match, RejectedMatch):
-        # The reference of the try serves on.
-        return replace(state, keyframes=_with_prepared(state.keyframes, turned.keyframes)), before
+        return state, before
     if not similarity.is_active:
         for other in turned.similarity.keys:
             if other != key:
@@ -298,7 +292,7 @@ def free_of_pull(
         setup, freed, frame, match.candidate, match.removed, match.similarity.turn
     )
     if isinstance(again, RejectedMatch):
-        return replace(state, keyframes=_with_prepared(state.keyframes, freed.keyframes)), match
+        return state, match
     pulled = np.linalg.solve(frame.px_from_unit, pulled_px)
     widened = freed.filter.widen_measurements(np.outer(pulled, pulled))
     return replace(freed, filter=widened), again

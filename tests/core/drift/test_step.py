@@ -17,18 +17,23 @@
 from __future__ import annotations
 
 import pickle
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift import matching
 from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame
+from semcal_ros.core.drift.similarity import SimilarityState
 from semcal_ros.core.drift.tracker import DriftTracker, step
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
-from tests.helpers.drift_scenes import DriftingSpecimen, small_camera
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.register import Registration, register
+from tests.helpers.drift_scenes import DriftingSpecimen, Texture, noisy, small_camera
 
 TIMING = ScanTiming(0.9, 1, 0.1)
 SPECIMEN, CAMERA = DriftingSpecimen(pitch_m=0.1e-6, seed=3), small_camera(2000.0)
@@ -96,6 +101,39 @@ def test_what_was_tried_is_undone_by_going_on_from_the_state_before(keeps_histor
         assert np.array_equal(array, copy, equal_nan=array.dtype.kind == "f")
     assert_same(follow(setup, early, 5, 13)[1], updates)
     assert_same(follow(*pickle.loads(pickle.dumps((setup, early))), 5, 13)[1], updates)
+
+
+def test_a_rotation_that_explains_nothing_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+    activate, compare = SimilarityState.activate, register
+
+    def note(similarity: SimilarityState, *arguments: Any) -> SimilarityState:
+        tried.append(arguments)
+        return activate(similarity, *arguments)
+
+    def refuse_turned(*arguments: Any, **options: Any) -> Registration:
+        found = compare(*arguments, **options)
+        refused = Rejection(MatchFailure.DISSIMILAR, "does not look so without a rotation")
+        return replace(found, rejection=refused) if tried else found
+
+    monkeypatch.setattr(SimilarityState, "activate", note)
+    monkeypatch.setattr(matching, "register", refuse_turned)
+    texture, state, before = Texture(3), None, None
+    for k in range(6):
+        image = noisy(texture.view((0.2 * k, -0.1 * k), 192), 5.0, k)
+        if k >= 4:
+            # In two frames the right half lies lower, as if the specimen had turned.
+            image[:, 96:] = np.roll(image[:, 96:], 1, axis=0)
+        before = state
+        state, update = step(make_setup(), state, ScanFrame(image, None, None), float(k))
+        if tried:
+            break
+    assert state is not None and before is not None
+    # The shift alone did not hold, and neither did the rotation that would have explained more.
+    assert tried and not update.accepted and not state.similarity.is_active
+    # Frames are still compared with the mean, and not with the first frame, which the try went back to.
+    assert before.keyframes.prepared is not None and state.keyframes.prepared is not None
+    assert state.keyframes.prepared.keyframe.averaged == 4
 
 
 def test_images_are_shared_between_states() -> None:
