@@ -36,21 +36,13 @@ from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.shared_sequence import SharedSequence
 from semcal_ros.core.drift.smoother import Event, Mark, estimate_process_noise, replay
 from semcal_ros.core.drift.state import DriftState
-
-# Logarithm by which the process noise changes with an innovation of one unit of excess: some five
-# frames are averaged.
-_ADAPTATION = 0.2
-# A normalised innovation squared (2 on average) counts as at most three times as large as it should
-# be, so that a single outlier raises the process noise by no more than 1.5.
-_MAX_NIS = 6.0
-# Process noise that moves the drift by less than this part of a measurement's sigma between two
-# frames has no effect.
-_MIN_MOTION = 0.02
-# Frame intervals in which an acceleration decays: with a longer time constant the filter follows a
-# smooth drift more closely, and overshoots when a rough one turns.
-_TIME_CONSTANT = 1.0
-# Numbers of measurements after which the process noise is estimated again from all of them.
-_ESTIMATE_AFTER = (4, 8, 16)
+from semcal_ros.core.drift.thresholds import (
+    ADAPTATION,
+    ESTIMATED_AFTER,
+    INNOVATION_RATIO_MAX,
+    MOTION_MIN,
+    TIME_CONSTANT_FRAMES,
+)
 
 
 @dataclass(frozen=True)
@@ -142,7 +134,7 @@ class DriftFilter:
         """Note that the present state is that of a frame."""
         if self.keeps_history:
             return replace(self, log=self.log.with_item(Mark()))
-        if self.unmeasured is None and self.measured >= _ESTIMATE_AFTER[-1]:
+        if self.unmeasured is None and self.measured >= ESTIMATED_AFTER[-1]:
             return replace(self, log=SharedSequence())
         return self
 
@@ -165,7 +157,7 @@ class DriftFilter:
         process_noise = replace(
             self.process_noise,
             psd=psd if self.adapts else self.process_noise.psd,
-            time_constant_s=_TIME_CONSTANT * interval_s,
+            time_constant_s=TIME_CONSTANT_FRAMES * interval_s,
         )
         variances = [0.0, sigma**2, process_noise.acceleration_variance]
         prior = Inflate(np.diag(np.repeat(variances, 2)))
@@ -209,7 +201,7 @@ class DriftFilter:
             unmeasured=None,
             measured=self.measured + 1,
         )
-        if self.adapts and updated.measured in _ESTIMATE_AFTER and self.process_noise.psd > 0.0:
+        if self.adapts and updated.measured in ESTIMATED_AFTER and self.process_noise.psd > 0.0:
             return updated._estimate_process_noise()
         return updated
 
@@ -220,7 +212,7 @@ class DriftFilter:
         interval_s = float(np.median(np.diff([self.start.time_s, *times])))
         near = self.process_noise
         if interval_s > 0.0:
-            near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
+            near = replace(near, time_constant_s=TIME_CONSTANT_FRAMES * interval_s)
         process_noise = estimate_process_noise(self.start, events, near, (1.0,))
         state = replay(self.start, events, process_noise)
         return replace(self, process_noise=process_noise, state=state)
@@ -229,7 +221,7 @@ class DriftFilter:
         """Add a covariance (2, 2) of the shift to all measurements so far, or to the present drift where they are no
         longer kept.
         """
-        if not self.keeps_history and self.measured >= _ESTIMATE_AFTER[-1]:
+        if not self.keeps_history and self.measured >= ESTIMATED_AFTER[-1]:
             both = np.zeros((6, 6))
             both[:2, :2] = covariance
             return self.apply(Inflate(both))
@@ -262,7 +254,7 @@ class DriftFilter:
         """
         if not self.adapts or self.measured <= 1 or not dt_s > 0.0:
             return self
-        excess = float(np.clip(0.5 * nis, 0.0, _MAX_NIS)) - 1.0
-        least = 3.0 * _MIN_MOTION**2 * 0.5 * float(np.trace(noise)) / dt_s**3
-        psd = max(self.process_noise.psd * float(np.exp(_ADAPTATION * excess)), least)
+        excess = float(np.clip(0.5 * nis, 0.0, INNOVATION_RATIO_MAX)) - 1.0
+        least = 3.0 * MOTION_MIN**2 * 0.5 * float(np.trace(noise)) / dt_s**3
+        psd = max(self.process_noise.psd * float(np.exp(ADAPTATION * excess)), least)
         return replace(self, process_noise=replace(self.process_noise, psd=psd))

@@ -21,16 +21,18 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.gating import GATE, OutlierTest, inflate_position, judge_shift
+from semcal_ros.core.drift.gating import OutlierTest, inflate_position, judge_shift
 from semcal_ros.core.drift.matching import Match, RejectedMatch
 from semcal_ros.core.drift.measurement import add_zoom_uncertainty
-from semcal_ros.core.drift.new_keyframes import SMALL_ZOOM, change_scale
+from semcal_ros.core.drift.new_keyframes import change_scale
 from semcal_ros.core.drift.own_motion import BodyFrame
+from semcal_ros.core.drift.thresholds import (
+    DISPUTED_SIGMAS,
+    INNOVATION_CHI2_MAX,
+    SMALL_ZOOM,
+)
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
 from semcal_ros.core.errors import Rejection
-
-# A disputed position counts as two standard deviations away.
-_DISPUTED_SIGMAS = 2.0
 
 
 def use_match(
@@ -66,7 +68,7 @@ def use_match(
     )
     state = replace(state, outliers=outliers)
     if isinstance(judged, Rejection):
-        deviation = innovation / _DISPUTED_SIGMAS
+        deviation = innovation / DISPUTED_SIGMAS
         disputed = np.outer(deviation, deviation)
         return state, RejectedMatch(judged, match.registration, disputed)
     if sees_again:
@@ -77,7 +79,7 @@ def use_match(
         state = replace(state, lines=state.lines.begin_or_go_on(along, state.filter))
     since_s = drift.time_s - state.time_s
     state = replace(state, similarity=state.similarity.use(match.similarity, since_s))
-    if outcome.shear_nis > GATE:
+    if outcome.shear_nis > INNOVATION_CHI2_MAX:
         measure = measure.without_shear()
     if match.candidate.ratio > SMALL_ZOOM:
         measure = replace(measure, zoom=zoomed.zoom)

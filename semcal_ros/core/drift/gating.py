@@ -24,20 +24,15 @@ from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.operations import Inflate, Measure
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import (
+    DAMPING,
+    INNOVATION_CHI2_MAX,
+    INTERVAL_S_MIN,
+    REACH_SIGMAS,
+    WHOLE_SHARE_MIN,
+)
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
-
-#: Innovations beyond this normalised square occur in a correct filter once in a million frames
-#: (chi-square with 2 degrees of freedom).
-GATE = 27.6
-# Part of the structure that must show a jump for it to be one of the stage.
-_WHOLE = 0.95
-# Multiple of the first step's sigma within which a shift agrees with what was expected: 95 %.
-_REACH_SIGMAS = 2.0
-# Divisions by intervals stay finite; no stream has frames that are nearer to each other.
-_MIN_INTERVAL_S = 1e-9
-# Keeps the scaled covariance invertible where a shift is predicted exactly.
-_DAMPING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -92,7 +87,7 @@ class OutlierTest:
         def is_near(expected: Array) -> bool:
             return bool(np.linalg.norm(np.linalg.solve(reach, position - expected)) <= 1.0)
 
-        since_s = max(state.time_s - (earlier[-1][0] if earlier else last_s), _MIN_INTERVAL_S)
+        since_s = max(state.time_s - (earlier[-1][0] if earlier else last_s), INTERVAL_S_MIN)
         innovation = float(np.sum((position - state.position) ** 2))
         spread = np.eye(2) * innovation
         if is_near(state.position):
@@ -103,7 +98,7 @@ class OutlierTest:
         points = earlier if self.expected is None else (self.expected, *earlier)
         if len(points) >= 2:
             (before_s, before), (latest_s, latest) = points[-2:]
-            velocities.append((latest - before) / max(latest_s - before_s, _MIN_INTERVAL_S))
+            velocities.append((latest - before) / max(latest_s - before_s, INTERVAL_S_MIN))
         for velocity in velocities:
             if is_near(earlier[-1][1] + velocity * since_s):
                 change = float(np.sum((velocity - state.velocity) ** 2))
@@ -166,12 +161,12 @@ def judge_shift(
     expected, _ = state.predict_shift(measure.key)
     x_px, y_px = np.abs(frame.px_from_unit @ (measure.shift[:2] - expected))
     width, height = frame.size
-    is_outlier = nis > GATE
+    is_outlier = nis > INNOVATION_CHI2_MAX
     if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
         reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
         return tests, Rejection(MatchFailure.STAGE_MOVE, reason)
-    is_far = max(x_px, y_px) > _REACH_SIGMAS * first_step_px
-    if share < _WHOLE and is_far and (is_first or is_outlier):
+    is_far = max(x_px, y_px) > REACH_SIGMAS * first_step_px
+    if share < WHOLE_SHARE_MIN and is_far and (is_first or is_outlier):
         reason = f"shift of {100.0 * share:.0f} % of the structure is {np.sqrt(nis):.0f} deviations from the prediction"
         return tests, Rejection(MatchFailure.OUTLIER, reason)
     if is_first or not is_outlier:
@@ -179,7 +174,7 @@ def judge_shift(
     position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]
     # What moves fast may also turn fast.
     step_px = float(np.hypot(*(frame.px_from_unit @ state.velocity))) * (state.time_s - last_s)
-    reach_px = max(_REACH_SIGMAS * first_step_px, step_px)
+    reach_px = max(REACH_SIGMAS * first_step_px, step_px)
     reach = np.asarray(reach_px * np.linalg.inv(frame.px_from_unit))
     tests, inflation = tests.explain(state, position, reach, last_s)
     if inflation is None:
@@ -229,7 +224,7 @@ def inflate_if_contradicted(
         return None
     expected, covariance = state.predict_shift(key)
     innovation = nearest - expected
-    if float(innovation @ solve_scaled(covariance, innovation, _DAMPING)) <= GATE:
+    if float(innovation @ solve_scaled(covariance, innovation, DAMPING)) <= INNOVATION_CHI2_MAX:
         return None
     spread = np.eye(2) * float(innovation @ innovation)
     return _inflate(spread, spread / since_s**2)

@@ -23,18 +23,13 @@ import numpy as np
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.keyframe import Keyframe, resample_keyframe, scale_ratio
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import (
+    CHANGE_MARGIN,
+    MEAN_COUNTS,
+    MERGED_OVERLAP_MIN,
+    SAME_SCALE,
+)
 from semcal_ros.core.registration.reference import Reference, RegistrationSettings
-
-#: Ratio of two scales below which images need no resampling: 0.05 px at the edge of 1024 px.
-SAME_SCALE = 1.0001
-# An old keyframe must overlap by this much more than is asked of the one in use, or two of them
-# would take turns.
-_CHANGE_MARGIN = 0.05
-# Frames are added to a mean where they show most of it.
-_MIN_MERGE_OVERLAP = 0.75
-#: Numbers of frames in a mean at which it replaces the prepared reference: each time its noise
-#: variance has halved. From 32 frames on, it adds 1.5 % to the sigma of a shift.
-MEAN_COUNTS = (2, 4, 8, 16, 32)
 
 
 @dataclass(frozen=True)
@@ -195,7 +190,7 @@ class KeyframeStore:
 
     def has_room(self, key: int, overlap: float) -> bool:
         """Whether a frame with that overlap would make the mean of a keyframe better."""
-        return self.keyframes[key].averaged < MEAN_COUNTS[-1] and overlap >= _MIN_MERGE_OVERLAP
+        return self.keyframes[key].averaged < MEAN_COUNTS[-1] and overlap >= MERGED_OVERLAP_MIN
 
     def resampled_reference(
         self, key: int, frame: ScanFrame, settings: RegistrationSettings
@@ -231,7 +226,7 @@ class KeyframeStore:
 
         def rank(candidate: Candidate) -> tuple[bool, bool, float]:
             in_use = candidate.key == self.current
-            good = candidate.overlap >= enough + (0.0 if in_use else _CHANGE_MARGIN)
+            good = candidate.overlap >= enough + (0.0 if in_use else CHANGE_MARGIN)
             return candidate.rescaled, not (in_use and good), -candidate.overlap
 
         return sorted(candidates, key=rank)

@@ -22,9 +22,8 @@ import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS, Candidate
+from semcal_ros.core.drift.keyframe_store import Candidate
 from semcal_ros.core.drift.measurement import (
-    MAX_SHEAR,
     exceeds_tolerance,
     is_removable,
     keyframe_noise,
@@ -33,22 +32,20 @@ from semcal_ros.core.drift.measurement import (
 from semcal_ros.core.drift.operations import Measure
 from semcal_ros.core.drift.remade_keyframes import correct_shear, forget_mean, single_keyframe
 from semcal_ros.core.drift.similarity import SimilarityMatch, constrain_registration
+from semcal_ros.core.drift.thresholds import (
+    MEAN_COUNTS,
+    PULLED_CHI2_MIN,
+    PULLED_PX,
+    REGISTRATIONS_MAX,
+    SHEAR_MAX,
+    TURN_LEFT_PX,
+)
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.rectification.raw_positions import similarity_matrix
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.register import Registration, register
-
-# Registrations of one frame; each removes the shear that the one before it measured.
-_MAX_REGISTRATIONS = 4
-# Rotation and scale that are left at the edge of a frame are worth another registration from here on.
-_MAX_TURN_PX = 0.1
-# What moves by less than this against the specimen may not have been found, and has pulled by a part of it at most, px.
-_MOST_PULLED_PX = 0.3
-# Chi-square (2 degrees of freedom) from which a mean is of frames that were pulled: of others, one in a hundred, which
-# costs a few frames until there is a mean again.
-_PULLED_CHI2 = 9.2
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ def match_keyframe(
     turn = state.similarity.expected_turn(candidate.key)
     state, match = _register(setup, state, frame, candidate, first, turn)
     state, match = _match_turned(setup, state, frame, match, candidate, first, turn)
-    for _ in range(_MAX_REGISTRATIONS - 1):
+    for _ in range(REGISTRATIONS_MAX - 1):
         if isinstance(match, RejectedMatch):
             break
         drift = match.measure(state.filter.state, state.filter.process_noise).state
@@ -133,7 +130,7 @@ def match_keyframe(
         corrected = False
         if not candidate.rescaled:
             state, corrected = correct_shear(setup, state, candidate.key, drift)
-        turned = match.similarity.remaining_px(frame.size) > _MAX_TURN_PX
+        turned = match.similarity.remaining_px(frame.size) > TURN_LEFT_PX
         moved = exceeds_tolerance(drift.motion - match.removed, frame)
         if not (corrected or moved or turned):
             break
@@ -170,7 +167,7 @@ def _register(
         guess_px=px_from_unit @ shift,
         guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
         image_region=region,
-        max_shear_px=MAX_SHEAR * frame.size[1],
+        max_shear_px=SHEAR_MAX * frame.size[1],
         suspected=state.moving,
         takes_lines=True,
         fixed=fixed,
@@ -273,16 +270,16 @@ def free_of_pull(
         first,
         match.image,
         guess_px=before.shift_px,
-        guess_covariance=before.covariance + np.eye(2) * _MOST_PULLED_PX**2,
+        guess_covariance=before.covariance + np.eye(2) * PULLED_PX**2,
         image_region=match.region,
-        max_shear_px=MAX_SHEAR * frame.size[1],
+        max_shear_px=SHEAR_MAX * frame.size[1],
         suspected=before.moving,
         fixed=match.fixed,
     )
     pulled_px = found.shift_px - before.shift_px
     if (
         not found.accepted
-        or float(pulled_px @ np.linalg.solve(found.covariance, pulled_px)) < _PULLED_CHI2
+        or float(pulled_px @ np.linalg.solve(found.covariance, pulled_px)) < PULLED_CHI2_MIN
     ):
         return state, match
     freed = state

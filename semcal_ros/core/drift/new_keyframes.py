@@ -33,28 +33,22 @@ from semcal_ros.core.drift.measurement import (
     measure_itself,
 )
 from semcal_ros.core.drift.operations import Measure
+from semcal_ros.core.drift.thresholds import (
+    BLUR_PX_MAX,
+    COPY_NOISE,
+    COPY_NOISE_BESIDE,
+    KEPT_CORRELATION_MIN,
+    MERGED_CORRELATION_MIN,
+    MERGED_GAINS,
+    MERGED_SHEAR_PX_MAX,
+    OPEN_SIGMAS,
+    PLACE_SIGMA_PX_MAX,
+    SMALL_ZOOM,
+)
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.reference import Reference
-
-#: Changes of scale up to which the keyframe stays in use, resampled for each frame.
-SMALL_ZOOM = 1.15
-# A frame whose correlation with its keyframe is lower takes its place: the specimen changes.
-_MIN_CORRELATION = 0.75
-# What frames must be like to become part of their keyframe's mean: a higher correlation, a gain
-# within a factor of two, and a shear that does not blur it.
-_MIN_MERGE_CORRELATION, _MERGE_GAINS, _MAX_MERGE_SHEAR_PX = 0.85, (0.5, 2.0), 0.1
-# Standard deviations of a measured shear within which it may be none, and the largest one then: a quarter of a pixel to
-# either side at the upper and the lower edge blurs structure at a third of a cycle per pixel by 4 % there.
-_OPEN_SIGMAS, _MAX_BLUR_PX = 2.0, 0.5
-# 1-sigma of a shift from which a frame would blur the mean as much.
-_MAX_PLACE_PX = 0.2
-# A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
-# noise weighs otherwise than as an image, and other parts of it are compared. Of the variance of the
-# frame's noise, this part, and this part times the fraction that did not overlap, as seen in the
-# closure of triples of frames.
-_COPY_NOISE, _COPY_NOISE_BESIDE = 0.15, 5.0
 
 
 def prepare_keyframe(
@@ -138,7 +132,7 @@ def change_scale(
     """
     before, now = state.keyframes[measure.key].frame.camera, frame.camera
     assert before is not None and now is not None
-    noise = zoom_covariance(before, now) + measure.covariance[:2, :2] * _COPY_NOISE
+    noise = zoom_covariance(before, now) + measure.covariance[:2, :2] * COPY_NOISE
     state = clone_measured(setup, state, frame, match, measure, noise)
     return state, measure_itself(state.keyframes.latest, measure, match.removed)
 
@@ -154,11 +148,11 @@ def renew_keyframe(
     state = replace(state, keyframes=state.keyframes.use(candidate.key))
     status, merged = DriftStatus.TRACKED, False
     overlap, enough = registration.alignment.overlap, setup.settings.rekey_overlap
-    is_changed = registration.correlation < _MIN_CORRELATION
+    is_changed = registration.correlation < KEPT_CORRELATION_MIN
     if is_changed or overlap < enough:
         following = state.keyframes.candidates(state.filter.state, frame, enough, SMALL_ZOOM)
         if is_changed or following[0].overlap < enough:
-            share = _COPY_NOISE + _COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
+            share = COPY_NOISE + COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
             noise = match.measure.covariance[:2, :2] * share
             measure = match.measure
             if candidate.rescaled:
@@ -187,15 +181,15 @@ def _is_mergeable(match: Match, store: KeyframeStore) -> bool:
     shear_px = np.abs(np.nan_to_num(alignment.joint_px[2:], nan=0.0))
     sigma_px = np.sqrt(np.diag(alignment.joint_covariance)[2:])
     # A few particles tell a shear badly: what they leave open is none.
-    shows_shear = shear_px > _MAX_MERGE_SHEAR_PX + _OPEN_SIGMAS * np.where(
+    shows_shear = shear_px > MERGED_SHEAR_PX_MAX + OPEN_SIGMAS * np.where(
         np.isfinite(sigma_px), sigma_px, 0.0
     )
     return (
         not candidate.rescaled
         and store.has_room(candidate.key, alignment.overlap)
-        and registration.correlation > _MIN_MERGE_CORRELATION
-        and _MERGE_GAINS[0] < registration.contrast < _MERGE_GAINS[1]
+        and registration.correlation > MERGED_CORRELATION_MIN
+        and MERGED_GAINS[0] < registration.contrast < MERGED_GAINS[1]
         and not np.any(shows_shear)
-        and float(np.max(shear_px)) < _MAX_BLUR_PX
-        and float(np.max(np.diag(registration.covariance))) < _MAX_PLACE_PX**2
+        and float(np.max(shear_px)) < BLUR_PX_MAX
+        and float(np.max(np.diag(registration.covariance))) < PLACE_SIGMA_PX_MAX**2
     )

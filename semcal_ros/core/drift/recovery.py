@@ -27,12 +27,13 @@ from semcal_ros.core.drift.gating import OutlierTest, inflate_if_contradicted, i
 from semcal_ros.core.drift.matching import RejectedMatch
 from semcal_ros.core.drift.measurement import is_removable
 from semcal_ros.core.drift.new_keyframes import add_keyframe, prepare_keyframe
+from semcal_ros.core.drift.thresholds import (
+    INTERVAL_S_MIN,
+)
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
 
-# Divisions by intervals stay finite.
-_MIN_INTERVAL_S = 1e-9
 # What an image looks like that shows another place: the prediction need not hold.
 _ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
 
@@ -60,7 +61,7 @@ def coast(
         body=state.body.update(None),
         rejected=state.rejected + is_of_keyframe,
     )
-    since_s = max(drift.time_s - last_s, _MIN_INTERVAL_S)
+    since_s = max(drift.time_s - last_s, INTERVAL_S_MIN)
     is_lost = state.rejected >= setup.settings.lost_after
     if is_lost:
         speed_px_s = setup.settings.first_step_px / since_s

@@ -20,10 +20,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-T = TypeVar("T")
+from semcal_ros.core.drift.thresholds import (
+    SEQUENCE_BLOCK,
+)
 
-# Cost: items in a block, which are copied when one is appended: some 0.3 us on average.
-_BLOCK = 128
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,12 @@ class SharedSequence(Generic[T]):
     def of(cls, items: Iterable[T]) -> SharedSequence[T]:
         """The sequence of some items."""
         every = tuple(items)
-        full = len(every) - len(every) % _BLOCK
-        blocks = tuple(every[k : k + _BLOCK] for k in range(0, full, _BLOCK))
+        full = len(every) - len(every) % SEQUENCE_BLOCK
+        blocks = tuple(every[k : k + SEQUENCE_BLOCK] for k in range(0, full, SEQUENCE_BLOCK))
         return cls(blocks, every[full:])
 
     def __len__(self) -> int:
-        return _BLOCK * len(self.blocks) + len(self.rest)
+        return SEQUENCE_BLOCK * len(self.blocks) + len(self.rest)
 
     def __iter__(self) -> Iterator[T]:
         for block in self.blocks:
@@ -60,6 +61,6 @@ class SharedSequence(Generic[T]):
     def with_item(self, item: T) -> SharedSequence[T]:
         """The sequence with an item more."""
         rest = (*self.rest, item)
-        if len(rest) < _BLOCK:
+        if len(rest) < SEQUENCE_BLOCK:
             return SharedSequence(self.blocks, rest)
         return SharedSequence((*self.blocks, rest))

@@ -37,7 +37,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.gating import GATE
 from semcal_ros.core.drift.measurement import keyframe_noise
 from semcal_ros.core.drift.operations import (
     CloneKeyframe,
@@ -52,28 +51,23 @@ from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.shared_sequence import SharedSequence
 from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import KEYFRAME_SIZE, MOTION_SIZE, DriftState, initial_state
+from semcal_ros.core.drift.thresholds import (
+    INNOVATION_CHI2_MAX,
+    INTERVAL_S_MIN,
+    RAW_DISTORTION,
+    RAW_OFF_CENTRE,
+    SCREEN_SIGMAS,
+    TURN_FLOOR_PX,
+    TURN_OF_SHIFT,
+    UNMEASURED_TURN,
+    UNPREDICTED_MAX,
+)
 from semcal_ros.core.rectification.raw_positions import rotation_centre, similarity_matrix
 from semcal_ros.core.registration.inverse_compositional import Alignment, SimilarityFit
 from semcal_ros.core.registration.register import Registration
 
-# Sigmas by which the left and the right half must differ before more than the shift is fitted: a
-# screen that costs nothing, and lets one frame in a hundred through by chance.
-_SCREEN_SIGMAS = 2.5
-# Largest unpredicted rotation (rad) and change of scale: beyond, a registration by shift alone fails.
-_MAX_UNPREDICTED = 0.01
-# As for the shear of a frame (measurement.py): what one linear step leaves, px over the image, and what any
-# distortion leaves, as a part of the shift.
-_FLOOR_PX, _OF_SHIFT = 0.02, 1e-3
-# Radial distortion and distance of its centre from the middle, in half widths, where there is no camera:
-# the 1-sigma of an uncalibrated one (ScanCamera.nominal).
-_RAW_DISTORTION, _RAW_OFF_CENTRE = 5e-3, 0.1
 # Places of the parameters in ScanCamera.covariance.
 _DISTORTIONS, _DISTORTION_CENTRE = slice(6, 8), slice(8, 10)
-# Rotation (rad) or scale between a frame and a keyframe of which nothing was measured: what fits
-# into the half of a pixel over 100 px that registration tolerates.
-_UNMEASURED = 5e-3
-# Divisions by intervals stay finite.
-_MIN_INTERVAL_S = 1e-9
 
 
 @dataclass(frozen=True)
@@ -239,7 +233,7 @@ class SimilarityState:
             return self._apply(self.filter, clone)
         mean, covariance = self.quiet[parent].mean, self.quiet[parent].covariance
         if fit is None:
-            covariance = covariance + np.eye(2) * _UNMEASURED**2
+            covariance = covariance + np.eye(2) * UNMEASURED_TURN**2
         else:
             mean, covariance = mean + fit.values[4:], covariance + fit.covariance[4:, 4:]
         return self._with_quiet(key, QuietKeyframe(mean, covariance, time_s))
@@ -300,7 +294,8 @@ class SimilarityState:
             covariance = covariance + _floor(registration, frame)
         unpredicted = np.abs(turn - self.expected_turn(key))
         if not (
-            _mahalanobis(fit.values[4:], covariance) > GATE and max(unpredicted) < _MAX_UNPREDICTED
+            _mahalanobis(fit.values[4:], covariance) > INNOVATION_CHI2_MAX
+            and max(unpredicted) < UNPREDICTED_MAX
         ):
             return None
         return np.asarray(turn)
@@ -348,7 +343,7 @@ class SimilarityState:
                 known, state = replace(self, filter=drift_filter), drift_filter.state
             outcome = measure(state, drift_filter.process_noise)
             nis = outcome.nis
-            if nis <= GATE:
+            if nis <= INNOVATION_CHI2_MAX:
                 state, operations = outcome.state, (measure,)
             elif self.was_outlier:
                 # Twice in a row: it turns otherwise than expected.
@@ -373,7 +368,7 @@ class SimilarityState:
                 updated = updated.update(operation).adapt_process_noise(match.nis, noise, since_s)
             else:
                 updated = updated.apply(operation)
-        return replace(self, filter=updated, was_outlier=bool(match.nis > GATE))
+        return replace(self, filter=updated, was_outlier=bool(match.nis > INNOVATION_CHI2_MAX))
 
     # -- evidence ---------------------------------------------------------------------------------
 
@@ -396,7 +391,7 @@ class SimilarityState:
             return self, None
         values = fit.values[4:]
         covariance = fit.covariance[4:, 4:] + _floor(registration, frame)
-        if _mahalanobis(values, covariance) <= GATE:
+        if _mahalanobis(values, covariance) <= INNOVATION_CHI2_MAX:
             return self, None
         before, known = self.suspected, replace(self, suspected=(time_s, values))
         if before is None or before[0] != last_s:
@@ -420,7 +415,7 @@ class SimilarityState:
             replace(state, mean=mean, covariance=covariance), None, keeps_history=self.keeps_history
         ).add_keyframe(key, np.zeros(4), 0.0)
         times = [t for t in self.times if t >= start.time_s]
-        interval_s = max(time_s - (times[-1] if times else start.time_s), _MIN_INTERVAL_S)
+        interval_s = max(time_s - (times[-1] if times else start.time_s), INTERVAL_S_MIN)
         # All of it may have come in the last interval.
         step = float(np.hypot(*turn))
         drift_filter = drift_filter.set_motion_prior(
@@ -497,16 +492,16 @@ def _floor(registration: Registration, frame: ScanFrame) -> Array:
     camera, width = frame.camera, float(frame.size[0])
     xi, off_centre, per_width = 0.0, 0.0, 2.0
     if camera is None:
-        xi, off_centre = _RAW_DISTORTION, _RAW_OFF_CENTRE
+        xi, off_centre = RAW_DISTORTION, RAW_OFF_CENTRE
     elif camera.covariance is not None:
         variances = np.diag(camera.covariance)
         xi = float(np.sqrt(np.max(variances[_DISTORTIONS])))
         per_width = width / camera.norm_px
         off_centre = float(np.sqrt(np.sum(variances[_DISTORTION_CENTRE]))) / camera.norm_px
     part = float(np.hypot(*registration.shift_px)) / width
-    linear = max(_OF_SHIFT, 6.0 * xi * off_centre * per_width) * part
+    linear = max(TURN_OF_SHIFT, 6.0 * xi * off_centre * per_width) * part
     curved = 3.0 * xi * (part * per_width) ** 2
-    return np.eye(2) * ((_FLOOR_PX / width) ** 2 + linear**2 + curved**2)
+    return np.eye(2) * ((TURN_FLOOR_PX / width) ** 2 + linear**2 + curved**2)
 
 
 def _half_lever_px(alignment: Alignment, frame: ScanFrame) -> float:
@@ -516,7 +511,7 @@ def _half_lever_px(alignment: Alignment, frame: ScanFrame) -> float:
 
 def _stands_out(alignment: Alignment) -> bool:
     square, variance = alignment.half_difference_px[0] ** 2, alignment.half_variance[0]
-    return bool(np.any(square > _SCREEN_SIGMAS**2 * variance))
+    return bool(np.any(square > SCREEN_SIGMAS**2 * variance))
 
 
 def _mahalanobis(vector: Array, covariance: Array) -> float:

@@ -26,20 +26,19 @@ import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.fixed_parts import (
-    LEAST_MOVE_PX,
     find_fixed_parts,
     share_of_gradients,
 )
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
-
-# Frames in which an overlay is looked for: the first ones, and then every so many.
-_FIRST_LOOKS, _LOOK_EVERY = 3, 8
-# What stays in place is looked for as soon as the specimen has moved, the first times, and then after one frame more
-# each time, up to so many: a spot does not show where the specimen is as dark.
-_FIXED_FIRST, _FIXED_LATER = 4, 32
-# Part of the image that must newly be found to stay, for keyframes to be freed of it.
-_NEWLY_FIXED = 2e-4
+from semcal_ros.core.drift.thresholds import (
+    FIXED_EVERY_FRAMES_MAX,
+    FIXED_FIRST,
+    FIXED_MOVE_PX_MIN,
+    NEWLY_FIXED,
+    OVERLAY_EVERY_FRAMES,
+    OVERLAY_FIRST_FRAMES,
+)
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class StaticParts:
         """Look in one frame more for what is drawn into them; whether any was found for the first time."""
         frames = self.frames + 1
         parts = replace(self, frames=frames)
-        looks = frames <= _FIRST_LOOKS or frames % _LOOK_EVERY == 0
+        looks = frames <= OVERLAY_FIRST_FRAMES or frames % OVERLAY_EVERY_FRAMES == 0
         if not looks or self.before is None or np.array_equal(self.before, image):
             return parts, False
         found = find_overlay(self.before, image)
@@ -103,7 +102,7 @@ class StaticParts:
 
     def keep(self, image: AnyImage) -> StaticParts:
         """Keep a frame as it came, where the next one is compared with it."""
-        if self.frames < _FIRST_LOOKS or (self.frames + 1) % _LOOK_EVERY == 0:
+        if self.frames < OVERLAY_FIRST_FRAMES or (self.frames + 1) % OVERLAY_EVERY_FRAMES == 0:
             return replace(self, before=image.copy())
         return self
 
@@ -134,16 +133,16 @@ class StaticParts:
             and np.allclose(earlier.px_from_unit, px_from_unit)
         ):
             since = earlier.since + 1
-            every = min(1 + max(0, self.comparisons - _FIXED_FIRST), _FIXED_LATER)
+            every = min(1 + max(0, self.comparisons - FIXED_FIRST), FIXED_EVERY_FRAMES_MAX)
             moved_px = drift_px - earlier.drift_px
-            if since < every or np.hypot(*moved_px) < LEAST_MOVE_PX:
+            if since < every or np.hypot(*moved_px) < FIXED_MOVE_PX_MIN:
                 return replace(self, earlier=replace(earlier, since=since)), None
             parts = replace(self, comparisons=self.comparisons + 1)
             found = find_fixed_parts(earlier.image, image, moved_px)
             if found is not None:
                 known = np.zeros_like(found.stays) if self.fixed is None else self.fixed
                 parts = replace(parts, fixed=found.stays | (known & ~found.moves))
-                if float(np.mean(found.stays & ~known)) > _NEWLY_FIXED:
+                if float(np.mean(found.stays & ~known)) > NEWLY_FIXED:
                     pulled_px = share_of_gradients(image, found.stays) * moved_px
         elif self.fixed is not None and self.fixed.shape != image.shape[:2]:
             parts = replace(self, fixed=None)

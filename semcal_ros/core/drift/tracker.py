@@ -56,16 +56,14 @@ from semcal_ros.core.drift.recovery import coast, restart
 from semcal_ros.core.drift.remade_keyframes import clean_keyframes
 from semcal_ros.core.drift.similarity import SimilarityState
 from semcal_ros.core.drift.state import initial_state
+from semcal_ros.core.drift.thresholds import (
+    CANDIDATES,
+    PAUSE_MIN,
+    VELOCITY_CHANGE,
+)
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.failures import MatchFailure
-
-# The velocity is expected to change by this part of the first step per frame, to begin with.
-_VELOCITY_CHANGE = 0.1
-# After this number of frame intervals without a frame nothing says that the drift went on as it was.
-_PAUSE = 10.0
-# Keyframes to try; twice as many where nothing matched before.
-_CANDIDATES = 2
 
 
 def step(
@@ -98,17 +96,7 @@ def step(
             if is_pulled:
                 frame = state.static.remove_from(frame)
                 state, update = _follow(setup, state, frame)
-    drift_filter = state.filter.mark_frame()
-    state = replace(
-        state,
-        filter=drift_filter,
-        similarity=state.similarity.mark_frame(drift_filter.state.time_s),
-        camera=frame.camera,
-        time_s=time_s,
-        static=state.static.keep(raw),
-        lines=replace(state.lines, of_unseen=state.unseen_covariance(frame.px_from_unit)),
-    )
-    return state, update
+    return _conclude(state, frame, raw, time_s), update
 
 
 def _begin(
@@ -151,7 +139,7 @@ def _predict(
         # of the velocity.
         unit_from_px = np.linalg.inv(frame.px_from_unit)
         first = setup.settings.first_step_px * float(np.linalg.norm(unit_from_px, 2))
-        psd = (_VELOCITY_CHANGE * first) ** 2 / dt**3
+        psd = (VELOCITY_CHANGE * first) ** 2 / dt**3
         drift_filter = drift_filter.set_motion_prior(first / dt, psd, dt)
     speed = float(np.hypot(*drift_filter.state.velocity))
     state = replace(
@@ -159,7 +147,7 @@ def _predict(
         filter=drift_filter.apply(Predict(time_s)),
         similarity=state.similarity.predict(time_s),
     )
-    if 0.0 < _PAUSE * drift_filter.process_noise.time_constant_s < dt:
+    if 0.0 < PAUSE_MIN * drift_filter.process_noise.time_constant_s < dt:
         state = state.inflate(inflate_after_pause(speed, dt))
     return state
 
@@ -184,7 +172,7 @@ def _follow(
     # Where nothing matched before, the image may be that of any of them.
     is_steady = state.rejected == 0 and state.filter.pending is None
     rejected: list[RejectedMatch] = []
-    for candidate in candidates[: _CANDIDATES if is_steady else 2 * _CANDIDATES]:
+    for candidate in candidates[: CANDIDATES if is_steady else 2 * CANDIDATES]:
         state, match = match_keyframe(setup, state, frame, candidate)
         if isinstance(match, Match) and is_repeated:
             # Noise never comes twice: the scan is paused, or the driver sent the frame again.
@@ -217,6 +205,19 @@ def _look_for_fixed(
     widened = state.filter.widen_measurements(np.outer(pulled, pulled))
     # The frame is measured once more, and is no repeated one.
     return clean_keyframes(setup, replace(state, filter=widened, sample=b"")), True
+
+
+def _conclude(state: TrackerState, frame: ScanFrame, raw: AnyImage, time_s: float) -> TrackerState:
+    """Keep what the next frame needs of this one, which came as ``raw``."""
+    return replace(
+        state,
+        filter=state.filter.mark_frame(),
+        similarity=state.similarity.mark_frame(state.filter.state.time_s),
+        camera=frame.camera,
+        time_s=time_s,
+        static=state.static.keep(raw),
+        lines=replace(state.lines, of_unseen=state.unseen_covariance(frame.px_from_unit)),
+    )
 
 
 class DriftTracker:

@@ -22,7 +22,6 @@ from scipy import stats
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.gating import (
-    GATE,
     OutlierTest,
     inflate_after_pause,
     inflate_if_contradicted,
@@ -30,6 +29,9 @@ from semcal_ros.core.drift.gating import (
 )
 from semcal_ros.core.drift.operations import Inflate
 from semcal_ros.core.drift.state import BASE_SIZE, DriftState
+from semcal_ros.core.drift.thresholds import (
+    INNOVATION_CHI2_MAX,
+)
 
 # Drift gets 2 units along x and 4 along y between two frames.
 REACH = np.diag([2.0, 4.0])
@@ -54,7 +56,7 @@ def opened(inflation: Inflate | None) -> tuple[Array, Array]:
 
 
 def test_the_gate_is_passed_once_in_a_million_frames() -> None:
-    assert stats.chi2.sf(GATE, 2) == pytest.approx(1e-6, rel=0.02)
+    assert stats.chi2.sf(INNOVATION_CHI2_MAX, 2) == pytest.approx(1e-6, rel=0.02)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
