@@ -28,11 +28,13 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath, DriftSettings, DriftUpdate
 from semcal_ros.core.drift.frame_time import (
-    SHEAR_OF_SHIFT_DISTORTED,
-    SHEAR_OF_SHIFT_RECTIFIED,
     estimate_frame_time,
 )
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.thresholds import (
+    SHEAR_OF_SHIFT_DISTORTED,
+    SHEAR_OF_SHIFT_RECTIFIED,
+)
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.files.recordings import RecordedFrame

@@ -36,9 +36,13 @@ ROOMS = [path.parent for path in TABLES if path.parent != PACKAGE / "core"]
 # A room with no more numbers than these may keep each beside its use.
 FEW = 4
 # Geometry and indices, nothing that could be otherwise: from a cell to its four neighbours; the unit matrix.
-NO_THRESHOLDS = {"STEPS", "_IDENTITY", "_MIRROR", "_PAIRS", "_SCALE"}
+NO_THRESHOLDS = {
+    *("STEPS", "_IDENTITY", "_MIRROR", "_PAIRS", "_SCALE"),
+    # Sizes of the parts of the state.
+    *("MOTION_SIZE", "BASE_SIZE", "KEYFRAME_SIZE"),
+}
 # Rooms whose numbers stand beside their uses, each with a comment, until they have a table.
-NOT_YET = {"core/drift", "core/registration"}
+NOT_YET = {"core/registration"}
 house = load_script("house")
 
 

@@ -12,11 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The Kalman filter of the drift, its history of events, and the adaptation of its process noise."""
+"""The Kalman filter of the drift, its history of events, and the adaptation of its process noise.
+
+A filter never changes: what happens to it makes another one, so that the one before is still there to go on from.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,155 +33,214 @@ from semcal_ros.core.drift.operations import (
     Predict,
 )
 from semcal_ros.core.drift.process_noise import ProcessNoise
+from semcal_ros.core.drift.shared_sequence import SharedSequence
 from semcal_ros.core.drift.smoother import Event, Mark, estimate_process_noise, replay
 from semcal_ros.core.drift.state import DriftState
-
-# Logarithm by which the process noise changes with an innovation of one unit of excess: some five
-# frames are averaged.
-_ADAPTATION = 0.2
-# A normalised innovation squared (2 on average) counts as at most three times as large as it should
-# be, so that a single outlier raises the process noise by no more than 1.5.
-_MAX_NIS = 6.0
-# Process noise that moves the drift by less than this part of a measurement's sigma between two
-# frames has no effect.
-_MIN_MOTION = 0.02
-# Frame intervals in which an acceleration decays: with a longer time constant the filter follows a
-# smooth drift more closely, and overshoots when a rough one turns.
-_TIME_CONSTANT = 1.0
-# Numbers of measurements after which the process noise is estimated again from all of them.
-_ESTIMATE_AFTER = (4, 8, 16)
+from semcal_ros.core.drift.thresholds import (
+    ADAPTATION,
+    ESTIMATED_AFTER,
+    INNOVATION_RATIO_MAX,
+    MOTION_MIN,
+    TIME_CONSTANT_FRAMES,
+)
 
 
-@dataclass
-class _PendingKeyframe:
-    """A keyframe whose own noise is known only when something has been registered against it."""
+@dataclass(frozen=True)
+class PendingKeyframe:
+    """A keyframe whose own noise is known only when something has been registered against it.
+
+    Attributes
+    ----------
+    operation
+        What made it a keyframe, without its noise.
+    index
+        Place of that operation among the events.
+    before
+        State before it.
+    """
 
     operation: AddKeyframe
     index: int
     before: DriftState
 
 
+@dataclass(frozen=True)
 class DriftFilter:
-    """State of the drift, kept up to date.
+    """The drift as it is known, with what led there. Each method returns another filter.
 
-    Parameters
+    Attributes
     ----------
     start
         State at the time at which the drift is zero.
-    acceleration_psd
-        Process noise, length^2 / s^3; None estimates it from the innovations.
-    history
-        Whether to keep all events, for a smoother.
+    state
+        State now.
+    process_noise
+        How much the drift changes by itself.
+    adapts
+        Whether the process noise follows the innovations.
+    keeps_history
+        Whether all events are kept, for a smoother.
+    log
+        What has happened since the start, as long as it may have to be done again.
+    measured
+        Number of measurements.
+    unmeasured
+        The keyframe that nothing was registered against yet.
     """
 
-    def __init__(self, start: DriftState, acceleration_psd: float | None, history: bool) -> None:
-        self.start = start
-        self.state = start
-        self.events: list[Event] = []
-        self.process_noise = ProcessNoise(acceleration_psd or 0.0)
-        self.measured = 0
-        self._adapts = acceleration_psd is None
-        self._history = history
-        self._pending: _PendingKeyframe | None = None
+    start: DriftState
+    state: DriftState
+    process_noise: ProcessNoise
+    adapts: bool
+    keeps_history: bool
+    log: SharedSequence[Event] = field(default_factory=SharedSequence)
+    measured: int = 0
+    unmeasured: PendingKeyframe | None = None
+
+    @classmethod
+    def begin(
+        cls, start: DriftState, acceleration_psd: float | None, *, keeps_history: bool
+    ) -> DriftFilter:
+        """The filter at its start.
+
+        Parameters
+        ----------
+        start
+            State at the time at which the drift is zero.
+        acceleration_psd
+            Process noise, length^2 / s^3; None estimates it from the innovations.
+        keeps_history
+            Whether to keep all events, for a smoother.
+        """
+        process_noise = ProcessNoise(acceleration_psd or 0.0)
+        return cls(start, start, process_noise, acceleration_psd is None, keeps_history)
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """What has happened, in order."""
+        return tuple(self.log)
 
     @property
     def pending(self) -> int | None:
-        """The keyframe that nothing was registered against yet."""
-        return None if self._pending is None else self._pending.operation.key
+        """Number of the keyframe that nothing was registered against yet."""
+        return None if self.unmeasured is None else self.unmeasured.operation.key
 
-    def apply(self, operation: Operation) -> None:
-        """Apply an operation to the state."""
-        self.state = operation(self.state, self.process_noise)
-        self.events.append(operation)
+    def apply(self, operation: Operation) -> DriftFilter:
+        """The filter after an operation on its state."""
+        state = operation(self.state, self.process_noise)
+        return replace(self, state=state, log=self.log.with_item(operation))
 
-    def mark_frame(self) -> None:
+    def mark_frame(self) -> DriftFilter:
         """Note that the present state is that of a frame."""
-        if self._history:
-            self.events.append(Mark())
-        elif self._pending is None and self.measured >= _ESTIMATE_AFTER[-1]:
-            self.events.clear()
+        if self.keeps_history:
+            return replace(self, log=self.log.with_item(Mark()))
+        if self.unmeasured is None and self.measured >= ESTIMATED_AFTER[-1]:
+            return replace(self, log=SharedSequence())
+        return self
 
-    def add_keyframe(self, key: int, removed: Array, acceleration_term_s2: float) -> None:
+    def add_keyframe(self, key: int, removed: Array, acceleration_term_s2: float) -> DriftFilter:
         """Make the present frame a keyframe that was not measured; :meth:`set_keyframe_noise` tells
         its noise later.
 
         The arguments are those of :class:`~semcal_ros.core.drift.operations.AddKeyframe`.
         """
         operation = AddKeyframe(key, removed, acceleration_term_s2, np.zeros((4, 4)), 0.0)
-        self._pending = _PendingKeyframe(operation, len(self.events), self.state)
-        self.apply(operation)
+        pending = PendingKeyframe(operation, len(self.log), self.state)
+        return replace(self.apply(operation), unmeasured=pending)
 
-    def set_motion_prior(self, sigma: float, psd: float, interval_s: float) -> None:
+    def set_motion_prior(self, sigma: float, psd: float, interval_s: float) -> DriftFilter:
         """Set the prior of the velocity, and of the process noise unless that was given; the
         keyframe of the first frame was taken at that velocity, too.
         """
-        pending = self._pending
+        pending = self.unmeasured
         assert pending is not None
-        given = self.process_noise.psd
-        self.process_noise = replace(
+        process_noise = replace(
             self.process_noise,
-            psd=psd if self._adapts else given,
-            time_constant_s=_TIME_CONSTANT * interval_s,
+            psd=psd if self.adapts else self.process_noise.psd,
+            time_constant_s=TIME_CONSTANT_FRAMES * interval_s,
         )
-        variances = [0.0, sigma**2, self.process_noise.acceleration_variance]
+        variances = [0.0, sigma**2, process_noise.acceleration_variance]
         prior = Inflate(np.diag(np.repeat(variances, 2)))
-        self.events.insert(pending.index, prior)
-        pending.index += 1
-        pending.before = prior(pending.before, self.process_noise)
-        self._replay_since(pending)
+        events = self.events
+        known = replace(
+            self,
+            process_noise=process_noise,
+            log=SharedSequence.of((*events[: pending.index], prior, *events[pending.index :])),
+            unmeasured=replace(
+                pending, index=pending.index + 1, before=prior(pending.before, process_noise)
+            ),
+        )
+        return known._replay_since_pending()
 
-    def set_keyframe_noise(self, noise: Array, scan_s: float) -> None:
+    def set_keyframe_noise(self, noise: Array, scan_s: float) -> DriftFilter:
         """Set the noise (4, 4) of the pending keyframe, and the time that it took."""
-        pending = self._pending
-        if pending is not None:
-            self.events[pending.index] = replace(pending.operation, noise=noise, scan_s=scan_s)
-            self._replay_since(pending)
+        pending = self.unmeasured
+        if pending is None:
+            return self
+        known = replace(pending.operation, noise=noise, scan_s=scan_s)
+        events = self.events
+        changed = (*events[: pending.index], known, *events[pending.index + 1 :])
+        return replace(self, log=SharedSequence.of(changed))._replay_since_pending()
 
-    def _replay_since(self, pending: _PendingKeyframe) -> None:
+    def _replay_since_pending(self) -> DriftFilter:
         """Apply again what happened since the pending keyframe: nothing but time has passed."""
+        pending = self.unmeasured
+        assert pending is not None
         state = pending.before
         for event in self.events[pending.index :]:
             if isinstance(event, Operation):
                 state = event(state, self.process_noise)
-        self.state = state
+        return replace(self, state=state)
 
-    def update(self, measure: Measure) -> None:
-        """Update the state by a measurement."""
-        self.state = measure(self.state, self.process_noise).state
-        self.events.append(measure)
-        self._pending = None
-        self.measured += 1
-        if self._adapts and self.measured in _ESTIMATE_AFTER and self.process_noise.psd > 0.0:
-            # The first guess is worth less than what was measured since.
-            times = [event.time_s for event in self.events if isinstance(event, Predict)]
-            interval_s = float(np.median(np.diff([self.start.time_s, *times])))
-            near = self.process_noise
-            if interval_s > 0.0:
-                near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
-            self.process_noise = estimate_process_noise(self.start, self.events, near, (1.0,))
-            self.state = replay(self.start, self.events, self.process_noise)
+    def update(self, measure: Measure) -> DriftFilter:
+        """The filter after a measurement."""
+        updated = replace(
+            self,
+            state=measure(self.state, self.process_noise).state,
+            log=self.log.with_item(measure),
+            unmeasured=None,
+            measured=self.measured + 1,
+        )
+        if self.adapts and updated.measured in ESTIMATED_AFTER and self.process_noise.psd > 0.0:
+            return updated._estimate_process_noise()
+        return updated
 
-    def widen_measurements(self, covariance: Array) -> None:
+    def _estimate_process_noise(self) -> DriftFilter:
+        """Estimate the process noise from all measurements: the first guess is worth less than they are."""
+        events = self.events
+        times = [event.time_s for event in events if isinstance(event, Predict)]
+        interval_s = float(np.median(np.diff([self.start.time_s, *times])))
+        near = self.process_noise
+        if interval_s > 0.0:
+            near = replace(near, time_constant_s=TIME_CONSTANT_FRAMES * interval_s)
+        process_noise = estimate_process_noise(self.start, events, near, (1.0,))
+        state = replay(self.start, events, process_noise)
+        return replace(self, process_noise=process_noise, state=state)
+
+    def widen_measurements(self, covariance: Array) -> DriftFilter:
         """Add a covariance (2, 2) of the shift to all measurements so far, or to the present drift where they are no
         longer kept.
         """
-        if not self._history and self.measured >= _ESTIMATE_AFTER[-1]:
+        if not self.keeps_history and self.measured >= ESTIMATED_AFTER[-1]:
             both = np.zeros((6, 6))
             both[:2, :2] = covariance
-            self.apply(Inflate(both))
-            return
-        self.events = [
+            return self.apply(Inflate(both))
+        events = tuple(
             event.widened(covariance) if isinstance(event, Measure | CloneKeyframe) else event
-            for event in self.events
-        ]
-        self.state = replay(self.start, self.events, self.process_noise)
+            for event in self.log
+        )
+        return replace(
+            self,
+            log=SharedSequence.of(events),
+            state=replay(self.start, events, self.process_noise),
+        )
 
-    def set_flicker(self, flicker: Array) -> None:
+    def set_flicker(self, flicker: Array) -> DriftFilter:
         """Set the variances (4,) of :attr:`.process_noise.ProcessNoise.flicker`."""
         x, y, vx, vy = flicker.tolist()
-        self.process_noise = replace(self.process_noise, flicker=(x, y, vx, vy))
+        return replace(self, process_noise=replace(self.process_noise, flicker=(x, y, vx, vy)))
 
-    def adapt_process_noise(self, nis: float, noise: Array, dt_s: float) -> None:
+    def adapt_process_noise(self, nis: float, noise: Array, dt_s: float) -> DriftFilter:
         """Change the process noise until innovations are as large as predicted.
 
         Parameters
@@ -190,9 +252,9 @@ class DriftFilter:
         dt_s
             Time since the frame before.
         """
-        if not self._adapts or self.measured <= 1 or not dt_s > 0.0:
-            return
-        excess = float(np.clip(0.5 * nis, 0.0, _MAX_NIS)) - 1.0
-        least = 3.0 * _MIN_MOTION**2 * 0.5 * float(np.trace(noise)) / dt_s**3
-        psd = max(self.process_noise.psd * float(np.exp(_ADAPTATION * excess)), least)
-        self.process_noise = replace(self.process_noise, psd=psd)
+        if not self.adapts or self.measured <= 1 or not dt_s > 0.0:
+            return self
+        excess = float(np.clip(0.5 * nis, 0.0, INNOVATION_RATIO_MAX)) - 1.0
+        least = 3.0 * MOTION_MIN**2 * 0.5 * float(np.trace(noise)) / dt_s**3
+        psd = max(self.process_noise.psd * float(np.exp(ADAPTATION * excess)), least)
+        return replace(self, process_noise=replace(self.process_noise, psd=psd))

@@ -27,23 +27,19 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
+from semcal_ros.core.drift.thresholds import (
+    FIXED_ENLARGED_PX,
+    FIXED_MOVE_PX_MIN,
+    FIXED_PIXELS_MIN,
+    FIXED_RATIO_MIN,
+    FIXED_SHARE_MAX,
+    FIXED_SQUARE_PX,
+    GRADIENTS_ALLOWED,
+    GRADIENTS_SMOOTHED_PX,
+    ROUNDING_VARIANCE,
+)
 from semcal_ros.core.registration.agreement import keep_bodies
 from semcal_ros.core.registration.fixed_pixels import grow_mask
-
-#: Drift from which on two images are compared: less of it hardly changes a picture with details of some pixels.
-LEAST_MOVE_PX = 0.8
-# Side of the squares over which squared differences are summed, px, and by which factor one of the two sums must exceed
-# the other: of 25 independent differences each, once in 10^6 by chance (F distribution). Differences that are smoothed
-# by interpolation are fewer, and 512 x 512 px are many squares; bodies of less than so many pixels do not count.
-_SQUARE_PX, _RATIO, _LEAST_PIXELS = 5, 8.0, 9
-# Differences of grey levels are at least those of rounding.
-_ROUNDING = 1.0 / 6.0
-# Part of the image that may stay: where more does, the shift is not that of the specimen.
-_MOST_STAYS = 0.3
-# By how much what stays is enlarged: its soft edge is told by less than its inside.
-_ENLARGED_PX = 2
-# Smoothing before gradients are summed, px, and what is allowed for the noise that is left.
-_SMOOTHED_PX, _ALLOWED = 1.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -74,12 +70,13 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
 
     Returns
     -------
-    None where nothing can be told: of different sizes, of a shift below :data:`LEAST_MOVE_PX` or beyond half of the
-    image, or where so much would stay that the shift is in doubt.
+    None where nothing can be told: of different sizes, of a shift below
+    :data:`~semcal_ros.core.drift.thresholds.FIXED_MOVE_PX_MIN` or beyond half of the image, or where so much would stay
+    that the shift is in doubt.
 
     It fails where the specimen repeats by the shift, and on a wrong shift of a specimen that has not moved.
     """
-    if before.shape != now.shape or np.hypot(*shift_px) < LEAST_MOVE_PX:
+    if before.shape != now.shape or np.hypot(*shift_px) < FIXED_MOVE_PX_MIN:
         return None
     first, second = _to_levels(before), _to_levels(now)
     height, width = first.shape
@@ -103,17 +100,21 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
         )
         squares = _sum_squares(image - there)
         inside = (
-            cv2.erode(covered, np.ones((_SQUARE_PX + 4, _SQUARE_PX + 4), np.uint8), borderValue=0)
+            cv2.erode(
+                covered,
+                np.ones((FIXED_SQUARE_PX + 4, FIXED_SQUARE_PX + 4), np.uint8),
+                borderValue=0,
+            )
             > 0
         )
         moved[k][inside] = squares[inside]
     known = np.isfinite(moved).all(axis=0)
-    stays = known & (moved.min(axis=0) > _RATIO * in_place)
-    moves = known & (in_place > _RATIO * moved.max(axis=0))
-    stays = keep_bodies(stays, _LEAST_PIXELS)
-    if float(np.mean(stays)) > _MOST_STAYS:
+    stays = known & (moved.min(axis=0) > FIXED_RATIO_MIN * in_place)
+    moves = known & (in_place > FIXED_RATIO_MIN * moved.max(axis=0))
+    stays = keep_bodies(stays, FIXED_PIXELS_MIN)
+    if float(np.mean(stays)) > FIXED_SHARE_MAX:
         return None
-    enlarged = grow_mask(stays, _ENLARGED_PX)
+    enlarged = grow_mask(stays, FIXED_ENLARGED_PX)
     return FixedParts(enlarged, np.asarray(moves & ~enlarged))
 
 
@@ -123,13 +124,13 @@ def share_of_gradients(image: AnyImage, part: Mask) -> float:
     A shift is pulled to that of the part by as much of the difference. The image is smoothed against noise, which has
     gradients, too; those that are left are allowed for by a factor of two.
     """
-    smoothed = cv2.GaussianBlur(_to_levels(image), (0, 0), _SMOOTHED_PX)
+    smoothed = cv2.GaussianBlur(_to_levels(image), (0, 0), GRADIENTS_SMOOTHED_PX)
     squares = (
         cv2.Sobel(smoothed, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(smoothed, cv2.CV_32F, 0, 1) ** 2
     )
     whole = float(np.sum(squares, dtype=np.float64))
     inside = float(np.sum(squares[part], dtype=np.float64))
-    return min(1.0, _ALLOWED * inside / max(whole, 1e-30))
+    return min(1.0, GRADIENTS_ALLOWED * inside / max(whole, 1e-30))
 
 
 def _to_levels(image: AnyImage) -> Image:
@@ -138,6 +139,6 @@ def _to_levels(image: AnyImage) -> Image:
 
 
 def _sum_squares(difference: Image) -> Image:
-    size = (_SQUARE_PX, _SQUARE_PX)
+    size = (FIXED_SQUARE_PX, FIXED_SQUARE_PX)
     found = cv2.boxFilter(difference**2, cv2.CV_32F, size, normalize=True)
-    return np.asarray(found + np.float32(_ROUNDING))
+    return np.asarray(found + np.float32(ROUNDING_VARIANCE))

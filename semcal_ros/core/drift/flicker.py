@@ -30,87 +30,87 @@ columns, in which what moves whole lines cancels.
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Indices
+from semcal_ros.core.drift.thresholds import (
+    DENSITY_GAIN_MIN,
+    FLICKER_FRAMES,
+    FLICKER_GROWTH,
+    FLICKER_ITERATIONS,
+    FLICKER_MODES,
+    FLICKER_OUTLIER,
+    FLICKER_SHIFT_MAX,
+    JITTER_GAIN_MIN,
+    MIXED_GAIN_MIN,
+    MOVING_RATIO_MIN,
+    MOVING_SIGMAS,
+    POWER_MIN,
+    POWER_OF_MODE,
+    VARIANCE_OF_MEAN,
+    VARIANCE_OF_SHEAR,
+)
 from semcal_ros.core.registration.register import Registration
 
-# Modes that are used: the lowest after the line; 15 rows of tiles resolve them.
-_MODES = np.arange(2, 10)
-# Gains in twice the log likelihood (chi-square with 1 degree of freedom). Where the rows do not clearly move, by this
-# multiple of the noise and two sigmas, a density must explain them better than nothing does at a level that chance
-# reaches once in 4000 times. Where they do, the question is only whether lines jitter one by one instead: that
-# must explain them better by two sigmas; and beside it, 1/f noise must gain one: too large an
-# uncertainty is the lesser evil.
-_SIGNIFICANT, _TWO_SIGMAS, _ONE_SIGMA = 12.0, 4.0, 1.0
-_MOVING, _SIGMAS_MOVING = 2.0, 2.0
-# Ratios of powers stay finite.
-_TINY = 1e-30
-# Frames that are remembered, and the multiple of their median power from which one is left out: chance makes less
-# of sixteen numbers, an image that is wrong in places makes much more.
-_KEPT, _OUTLIER = 64, 20.0
-# An estimate is made again after this much more: it has become more certain by a fifth.
-_GROWTH = 1.5
-# Iterations of the fit: amounts are then right to some per cent.
-_ITERATIONS = 60
-# Part of the field by which a frame may be shifted: beyond, distortion bends it, too.
-_MAX_SHIFT = 0.1
-# Power of a mode of 1/f noise about its line, times m: 1 but for the line and the ends (4000 simulated frames).
-_OF_MODE = 0.9
-# Integral of (1 - sinc f)^2 / f up to 12 cycles per frame, which 24 rows of tiles resolve, and of the square of the
-# response of a fitted line, from a quarter of a cycle per frame on: what is slower is drift.
-_OF_MEAN, _OF_SHEAR = 3.0, 7.8
+_MODES = np.arange(*FLICKER_MODES)
 
 
+@dataclass(frozen=True)
 class FlickerEstimator:
-    """Density of the 1/f noise of a stream, from its latest registrations."""
+    """Density of the 1/f noise of a stream, from its latest registrations. Each makes another one.
 
-    def __init__(self) -> None:
-        self._powers: deque[Array] = deque(maxlen=_KEPT)
-        self._count, self._due = 0, 1
+    Attributes
+    ----------
+    powers
+        (2, modes, 2) of each of the latest: of x and y, of the whole and of the noise of the images.
+    count
+        Number of registrations.
+    due
+        Their number at which the density is estimated the next time.
+    """
 
-    @property
-    def count(self) -> int:
-        """Number of registrations."""
-        return self._count
+    powers: tuple[Array, ...] = ()
+    count: int = 0
+    due: int = 1
 
-    def add(self, registration: Registration, averaged: float, size: tuple[int, int]) -> bool:
+    def add(
+        self, registration: Registration, averaged: float, size: tuple[int, int]
+    ) -> tuple[FlickerEstimator, bool]:
         """Add a registration against the mean of ``averaged`` frames of ``size`` (width, height); whether the
         next estimate is due.
         """
-        if np.any(np.abs(registration.shift_px) > _MAX_SHIFT * np.array(size)):
-            return False
+        if np.any(np.abs(registration.shift_px) > FLICKER_SHIFT_MAX * np.array(size)):
+            return self, False
         power = registration.alignment.row_power(int(_MODES[-1]) + 1)
         if power is None:
-            return False
+            return self, False
         # The keyframe is bent, too.
         known = np.full((2, len(_MODES), 2), np.nan)
         modes = power.shape[1] - int(_MODES[0])
         known[:, :modes] = power[:, _MODES[:modes]] / (1.0 + 1.0 / averaged)
-        self._powers.append(known)
-        self._count += 1
-        if self._count < self._due:
-            return False
-        self._due = min(int(np.ceil(_GROWTH * self._count)), self._count + _KEPT)
-        return True
+        count, due = self.count + 1, self.due
+        if count >= due:
+            due = min(int(np.ceil(FLICKER_GROWTH * count)), count + FLICKER_FRAMES)
+        after = FlickerEstimator((*self.powers, known)[-FLICKER_FRAMES:], count, due)
+        return after, due > self.due
 
     def variance_px2(self) -> Array:
         """(4,) variances of the shift of a frame (x, y) about that of its middle, and of its shear; zero
         where there is no 1/f noise to be seen.
         """
-        if not self._powers:
+        if not self.powers:
             return np.zeros(4)
-        powers = np.array(self._powers)
+        powers = np.array(self.powers)
         total = np.nanmean(powers, axis=(1, 2, 3))
-        powers = powers[total <= _OUTLIER * np.median(total)]
+        powers = powers[total <= FLICKER_OUTLIER * np.median(total)]
         counts = np.count_nonzero(np.isfinite(powers[:, 0, :, 0]), axis=0).astype(np.float64)
         seen = counts > 0.0
         whole, noise = np.nanmean(powers[:, :, seen], axis=0)
         modes, counts = _MODES[seen], counts[seen]
         density = np.array([_fit_density(whole[:, k], noise[:, k], modes, counts) for k in (0, 1)])
-        return np.concatenate([_OF_MEAN * density, _OF_SHEAR * density])
+        return np.concatenate([VARIANCE_OF_MEAN * density, VARIANCE_OF_SHEAR * density])
 
 
 def _fit_density(whole: Array, noise: Array, modes: Indices, counts: Array) -> float:
@@ -118,13 +118,13 @@ def _fit_density(whole: Array, noise: Array, modes: Indices, counts: Array) -> f
     them as well.
     """
     # The logarithm of a ratio of two chi-squares with n degrees of freedom has a sigma of 2 / sqrt(n).
-    ratio = float(counts @ whole) / max(float(counts @ noise), _TINY)
-    chance = float(np.exp(2.0 * _SIGMAS_MOVING / np.sqrt(np.sum(counts))))
+    ratio = float(counts @ whole) / max(float(counts @ noise), POWER_MIN)
+    chance = float(np.exp(2.0 * MOVING_SIGMAS / np.sqrt(np.sum(counts))))
     if ratio < chance:
         return 0.0
-    level = np.full(len(modes), max(float(np.mean(noise)), _TINY))
+    level = np.full(len(modes), max(float(np.mean(noise)), POWER_MIN))
     white = np.ones((len(modes), 1))
-    pink = (_OF_MODE / modes)[:, None]
+    pink = (POWER_OF_MODE / modes)[:, None]
 
     def gain(before: Array, after: Array) -> float:
         return float(np.sum(counts * (np.log(before / after) + whole / before - whole / after)))
@@ -132,12 +132,12 @@ def _fit_density(whole: Array, noise: Array, modes: Indices, counts: Array) -> f
     _, plain = _fit_powers(whole, white, level, counts)
     values, fitted = _fit_powers(whole, pink, level, counts)
     mixed, fitted_mixed = _fit_powers(whole, np.column_stack([pink, white]), level, counts)
-    needed = -_TWO_SIGMAS
-    if gain(fitted, fitted_mixed) > _TWO_SIGMAS:
+    needed = -JITTER_GAIN_MIN
+    if gain(fitted, fitted_mixed) > JITTER_GAIN_MIN:
         # Lines do not jitter by an amount that is not seen.
-        values, fitted, needed = mixed, fitted_mixed, _ONE_SIGMA
-    if ratio < _MOVING * chance:
-        needed = _SIGNIFICANT
+        values, fitted, needed = mixed, fitted_mixed, MIXED_GAIN_MIN
+    if ratio < MOVING_RATIO_MIN * chance:
+        needed = DENSITY_GAIN_MIN
     return float(values[0]) if gain(plain, fitted) > needed else 0.0
 
 
@@ -148,7 +148,7 @@ def _fit_powers(whole: Array, columns: Array, level: Array, counts: Array) -> tu
     amounts more likely (Fevotte and Idier 2011, doi:10.1162/NECO_a_00168).
     """
     amounts = np.full(columns.shape[1], float(np.mean(whole)))
-    for _ in range(_ITERATIONS):
+    for _ in range(FLICKER_ITERATIONS):
         expected = columns @ amounts + level
         risen = columns.T @ (counts * whole / expected**2)
         amounts = amounts * np.sqrt(risen / (columns.T @ (counts / expected)))

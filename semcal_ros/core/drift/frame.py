@@ -28,6 +28,15 @@ from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Mask, check
 from semcal_ros.core.caches import LruCache
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift.thresholds import (
+    CUBIC_REACH_PX,
+    EDGE_POINTS,
+    FIXED_PART_MAX,
+    NEGLIGIBLE_PX,
+    REGIONS,
+    SAMPLES,
+    SHRINKS_MAX,
+)
 from semcal_ros.core.rectification.raw_positions import (
     RasterDrift,
     camera_key,
@@ -37,21 +46,6 @@ from semcal_ros.core.rectification.raw_positions import (
 )
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.registration.reference import Region
-
-# Motions that displace pixels by less are left in a frame: a tenth of what registration resolves.
-_NEGLIGIBLE_PX = 1e-3
-# Cameras whose scanned region is remembered; a zoom passes through more, and comes back to few.
-_MAX_REGIONS = 16
-# Pixels along a side by whose noise a repeated image is recognised.
-_SAMPLES = 96
-# Points along each edge of a region at which it is checked; distortion is smooth between them.
-_EDGE_POINTS = 17
-# Steps in which a region shrinks until all of its edges were scanned; distortion takes 2.
-_MAX_SHRINKS = 4
-# A pixel of which a larger part is fixed does not show the specimen.
-_PART_OF_FIXED = 0.05
-# Pixels that a cubic interpolation reaches beyond a position.
-_REACH_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +80,7 @@ class ScanFrame:
     @property
     def sample(self) -> bytes:
         """Some of its pixels, by which an image that comes again is recognised."""
-        rows, cols = (max(1, n // _SAMPLES) for n in self.image.shape[:2])
+        rows, cols = (max(1, n // SAMPLES) for n in self.image.shape[:2])
         return np.ascontiguousarray(self.image[::rows, ::cols]).tobytes()
 
     @property
@@ -119,7 +113,7 @@ class MotionCorrector:
     def __init__(self, interpolation: str) -> None:
         self._rectifier = Rectifier(interpolation)
         self._turning = Rectifier("lanczos4")
-        self._regions: LruCache[tuple[object, ...], Region] = LruCache(_MAX_REGIONS)
+        self._regions: LruCache[tuple[object, ...], Region] = LruCache(REGIONS)
 
     def corrected_image(
         self,
@@ -148,7 +142,7 @@ class MotionCorrector:
         if turn is not None:
             displaced = displaced + float(np.hypot(*turn)) * 0.5 * float(np.hypot(width, height))
         drift = None
-        if float(np.max(displaced)) > _NEGLIGIBLE_PX:
+        if float(np.max(displaced)) > NEGLIGIBLE_PX:
             # The rectifier takes px where it is given no camera.
             unit = np.eye(2) if camera is not None else frame.px_from_unit
             drift = RasterDrift(np.zeros(2), unit @ motion[:2], unit @ motion[2:])
@@ -186,7 +180,7 @@ class MotionCorrector:
             return None
         drawn = replace(frame, image=np.where(frame.fixed, np.float32(1.0), np.float32(0.0)))
         image, _ = self.corrected_image(drawn, motion, turn, turn_rate)
-        return np.asarray(np.asarray(image, dtype=np.float32) > _PART_OF_FIXED)
+        return np.asarray(np.asarray(image, dtype=np.float32) > FIXED_PART_MAX)
 
 
 def _turned(
@@ -214,24 +208,24 @@ def _find_scanned_region(size: tuple[int, int], camera: ScanCamera | None) -> Re
     """Rectangle of output pixels that all come from inside the raw frame."""
     width, height = size
     left, top, right, bottom = 0, 0, width, height
-    for _ in range(_MAX_SHRINKS):
+    for _ in range(SHRINKS_MAX):
         x, y = (
-            np.linspace(left, right - 1, _EDGE_POINTS),
-            np.linspace(top, bottom - 1, _EDGE_POINTS),
+            np.linspace(left, right - 1, EDGE_POINTS),
+            np.linspace(top, bottom - 1, EDGE_POINTS),
         )
         edges = [
-            np.stack([np.full(_EDGE_POINTS, float(left)), y], axis=1),
-            np.stack([x, np.full(_EDGE_POINTS, float(top))], axis=1),
-            np.stack([np.full(_EDGE_POINTS, right - 1.0), y], axis=1),
-            np.stack([x, np.full(_EDGE_POINTS, bottom - 1.0)], axis=1),
+            np.stack([np.full(EDGE_POINTS, float(left)), y], axis=1),
+            np.stack([x, np.full(EDGE_POINTS, float(top))], axis=1),
+            np.stack([np.full(EDGE_POINTS, right - 1.0), y], axis=1),
+            np.stack([x, np.full(EDGE_POINTS, bottom - 1.0)], axis=1),
         ]
         raw = [raw_from_output(edge, size, camera, None, None) for edge in edges]
         # A hole in the distortion counts as far outside.
         lacking = [
-            _REACH_PX - np.nan_to_num(raw[0][:, 0], nan=-width / 8).min(),
-            _REACH_PX - np.nan_to_num(raw[1][:, 1], nan=-height / 8).min(),
-            np.nan_to_num(raw[2][:, 0], nan=1.125 * width).max() - (width - 1.0 - _REACH_PX),
-            np.nan_to_num(raw[3][:, 1], nan=1.125 * height).max() - (height - 1.0 - _REACH_PX),
+            CUBIC_REACH_PX - np.nan_to_num(raw[0][:, 0], nan=-width / 8).min(),
+            CUBIC_REACH_PX - np.nan_to_num(raw[1][:, 1], nan=-height / 8).min(),
+            np.nan_to_num(raw[2][:, 0], nan=1.125 * width).max() - (width - 1.0 - CUBIC_REACH_PX),
+            np.nan_to_num(raw[3][:, 1], nan=1.125 * height).max() - (height - 1.0 - CUBIC_REACH_PX),
         ]
         steps = [int(np.ceil(max(v, 0.0))) for v in lacking]
         left, top = min(left + steps[0], width // 3), min(top + steps[1], height // 3)

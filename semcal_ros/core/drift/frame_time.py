@@ -48,39 +48,25 @@ from scipy.optimize import nnls
 
 from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
-from semcal_ros.core.drift.keyframe_store import MEAN_COUNTS
+from semcal_ros.core.drift.thresholds import (
+    BEYOND_SIGMAS,
+    COMMON_SHEAR_SCALE_FLOOR,
+    CONVERGED_SIGMAS,
+    FRAME_SHEAR_FLOOR_PX,
+    HUBER_SIGMAS,
+    INFORMATION_MIN,
+    KEYFRAME_SHEAR_FLOOR_PX,
+    MEAN_COUNTS,
+    REWEIGHTED_MAX,
+    SCORED_FRAMES,
+    SHEAR_OF_SHIFT_DISTORTED,
+    SHEAR_SCALE_FLOOR,
+    TIME_SIGMAS_MIN,
+    TIMED_CHI2_MAX,
+    TIMED_FRAMES_MIN,
+)
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.wording import counted
-
-#: Shear per shift, 1-sigma, in images with their distortion, and where a calibration removed it: a
-#: distortion of 1 % at the edge of the field, and what is left of it.
-SHEAR_OF_SHIFT_DISTORTED, SHEAR_OF_SHIFT_RECTIFIED = 0.01, 0.001
-
-# Five unknowns, T and B, are estimated from two components of each frame.
-_MIN_FRAMES = 6
-# The estimate is used when it is known to 20 %.
-_MIN_RATIO = 5.0
-# Residuals that are 2.4 times as large as stated come from something else than noise.
-_MAX_CHI2 = 6.0
-# An estimate is longer than the frame interval if it is so by three standard deviations.
-_BEYOND_SIGMAS = 3.0
-# Errors that a registration does not state: of the shear of a frame, and of which frames are in the
-# mean of a keyframe, px.
-_FLOOR_PX = 0.005
-_KEYFRAME_FLOOR_PX = 0.01
-# A registration goes to the shear in one linear step, which is wrong by some percent, depending on
-# the specimen: in one frame, and in all frames of the same place.
-_SCALE_FLOOR = 0.03
-_COMMON_SCALE_FLOOR = 0.04
-# Normalised residuals of two components beyond this weigh less (1 in 20 good ones).
-_HUBER = 2.45
-_MAX_ITERATIONS = 50
-# The weights have converged when T changes by less than this part of its sigma.
-_CONVERGED_SIGMAS = 1e-3
-# Errors of smoothed velocities last for some frames: scores are summed over blocks of this number.
-_BLOCK = 5
-# Information on T, 1 / s^2, where the velocity does not change at all: keeps T at 0 and finite.
-_MIN_INFORMATION = 1e-12
 
 
 @dataclass(frozen=True)
@@ -136,7 +122,7 @@ def estimate_frame_time(
         raise InvalidValueError(f"shear_of_shift = {shear_of_shift}", expected="a number > 0")
     observed = _collect_observations(path)
     count = len(observed.shear)
-    if count < _MIN_FRAMES:
+    if count < TIMED_FRAMES_MIN:
         few = f"{counted(count, 'frame')} with a shear against an earlier one"
         return FrameTimeEstimate(np.nan, np.inf, count, np.nan, False, False, few)
     steps = np.diff(path.time_s)
@@ -216,14 +202,14 @@ def _flatten_noise(observed: _Observations) -> _Observations:
     show less of it would weigh more, and T would come out too small.
     """
     traces = np.trace(observed.own + observed.key, axis1=1, axis2=2)
-    stated = np.maximum(traces, _FLOOR_PX**2)
+    stated = np.maximum(traces, FRAME_SHEAR_FLOOR_PX**2)
     columns = np.stack([np.ones(len(stated)), np.sum(observed.shear**2, axis=1)], axis=1)
     (least, slope), _ = nnls(columns / stated[:, None], np.ones(len(stated)))
     share = np.ones(len(stated))
     if least > 0.0:
         share = least / (columns @ [least, slope])
-    own = observed.own * share[:, None, None] + np.eye(2) * _FLOOR_PX**2
-    key = observed.key * share[:, None, None] + np.eye(2) * _KEYFRAME_FLOOR_PX**2
+    own = observed.own * share[:, None, None] + np.eye(2) * FRAME_SHEAR_FLOOR_PX**2
+    key = observed.key * share[:, None, None] + np.eye(2) * KEYFRAME_SHEAR_FLOOR_PX**2
     return replace(observed, own=own, key=key)
 
 
@@ -271,7 +257,7 @@ def _fit_robustly(observed: _Observations, shear_of_shift: float, interval_s: fl
     design[:, 0, 1:3] = design[:, 1, 3:5] = observed.position
     groups = [np.flatnonzero(observed.group == g) for g in range(int(observed.group.max()) + 1)]
     time_s, trust, converged = 0.0, np.ones(len(observed.shear)), False
-    for step in range(_MAX_ITERATIONS):
+    for step in range(REWEIGHTED_MAX):
         # At most the interval: where the velocity does not change, T would grow without bound.
         limited_s = float(np.clip(time_s, 0.0, interval_s))
         solution = _solve(observed, design, groups, limited_s, trust, shear_of_shift)
@@ -279,12 +265,12 @@ def _fit_robustly(observed: _Observations, shear_of_shift: float, interval_s: fl
         chi2 = float(np.median(solution.squares)) / MEDIAN_CHI2_2
         sigma = float(np.sqrt(solution.covariance[0, 0]))
         normal = np.sqrt(solution.squares / max(chi2, 1.0))
-        trust = np.minimum(1.0, _HUBER / np.maximum(normal, 1e-9))
-        if step > 1 and abs(time_s - before) < _CONVERGED_SIGMAS * sigma:
+        trust = np.minimum(1.0, HUBER_SIGMAS / np.maximum(normal, 1e-9))
+        if step > 1 and abs(time_s - before) < CONVERGED_SIGMAS * sigma:
             converged = True
             break
     sigma = max(sigma * float(np.sqrt(max(chi2, 1.0))), solution.block_sigma)
-    sigma = float(np.hypot(sigma, _COMMON_SCALE_FLOOR * time_s))
+    sigma = float(np.hypot(sigma, COMMON_SHEAR_SCALE_FLOOR * time_s))
     return _Fit(time_s, sigma, chi2, converged)
 
 
@@ -309,10 +295,10 @@ def _solve(
     shear_of_shift: float,
 ) -> _Solution:
     """One weighted fit, in which the noise that frames with the same keyframe share is eliminated."""
-    expected = (_SCALE_FLOOR * time_s) ** 2 * np.sum(observed.velocity**2, axis=1)
+    expected = (SHEAR_SCALE_FLOOR * time_s) ** 2 * np.sum(observed.velocity**2, axis=1)
     own = observed.own + time_s**2 * observed.own_velocity + expected[:, None, None] * np.eye(2)
     weight = np.linalg.inv(own) * trust[:, None, None]
-    normal = np.diag([_MIN_INFORMATION] + [shear_of_shift**-2] * 4)
+    normal = np.diag([INFORMATION_MIN] + [shear_of_shift**-2] * 4)
     right = np.zeros(5)
     parts = []
     for members in groups:
@@ -333,7 +319,9 @@ def _solve(
         squares[members] = np.einsum("ni,nij,nj->n", own_residual, w, own_residual) / trust[members]
         scores[members] = np.einsum("nij,ni->nj", wa, own_residual)
     # Errors that last for some frames show where neighbours agree.
-    blocks = np.add.reduceat(scores, np.arange(0, len(scores), _BLOCK), axis=0) @ covariance[0]
+    blocks = (
+        np.add.reduceat(scores, np.arange(0, len(scores), SCORED_FRAMES), axis=0) @ covariance[0]
+    )
     return _Solution(mean, covariance, squares, float(np.sqrt(np.sum(blocks**2))))
 
 
@@ -342,16 +330,16 @@ def _assess(fit: _Fit, frames: int, interval_s: float) -> FrameTimeEstimate:
     time_s, sigma = fit.time_s, fit.sigma_s
     reason = ""
     if not fit.converged:
-        reason = f"the weights did not converge in {_MAX_ITERATIONS} steps"
-    elif not abs(time_s) > _MIN_RATIO * sigma:
+        reason = f"the weights did not converge in {REWEIGHTED_MAX} steps"
+    elif not abs(time_s) > TIME_SIGMAS_MIN * sigma:
         reason = f"{time_s:.3g} +- {sigma:.2g} s: the velocity of the drift changes too little"
     elif time_s < 0.0:
         reason = f"{time_s:.3g} +- {sigma:.2g} s is negative: something else shears the frames"
-    elif time_s - _BEYOND_SIGMAS * sigma > interval_s:
+    elif time_s - BEYOND_SIGMAS * sigma > interval_s:
         reason = (
             f"{time_s:.3g} +- {sigma:.2g} s is longer than the {interval_s:.3g} s between frames"
         )
-    elif fit.chi2 > _MAX_CHI2:
+    elif fit.chi2 > TIMED_CHI2_MAX:
         reason = f"the frames scatter {np.sqrt(fit.chi2):.1f} times as much as they should"
     if not reason:
         time_s = min(time_s, interval_s)

@@ -16,48 +16,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.operations import Inflate, Measure
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import (
+    DAMPING,
+    INNOVATION_CHI2_MAX,
+    INTERVAL_S_MIN,
+    REACH_SIGMAS,
+    WHOLE_SHARE_MIN,
+)
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 
-#: Innovations beyond this normalised square occur in a correct filter once in a million frames
-#: (chi-square with 2 degrees of freedom).
-GATE = 27.6
-# Part of the structure that must show a jump for it to be one of the stage.
-_WHOLE = 0.95
-# Multiple of the first step's sigma within which a shift agrees with what was expected: 95 %.
-_REACH_SIGMAS = 2.0
-# Divisions by intervals stay finite; no stream has frames that are nearer to each other.
-_MIN_INTERVAL_S = 1e-9
-# Keeps the scaled covariance invertible where a shift is predicted exactly.
-_DAMPING = 1e-9
 
-
+@dataclass(frozen=True)
 class OutlierTest:
-    """Test of shifts that the filter did not expect, one after the other.
+    """Test of shifts that the filter did not expect, one after the other. Each makes another test.
 
     One is used if drift can get that far between two frames, if the unexpected shift before agrees
     with it, or if the positions measured before, the last expected one included, show that the
     drift goes on like this.
+
+    Attributes
+    ----------
+    expected
+        Time and position of the last frame that came as expected.
+    unexpected
+        Those of the frames since, two at most.
     """
 
-    def __init__(self) -> None:
-        self._expected: tuple[float, Array] | None = None
-        self._unexpected: tuple[tuple[float, Array], ...] = ()
+    expected: tuple[float, Array] | None = None
+    unexpected: tuple[tuple[float, Array], ...] = ()
 
-    def reset(self, state: DriftState | None = None) -> None:
-        """Note that a frame came as expected, with that state; None where tracking starts again."""
-        self._unexpected = ()
-        self._expected = None if state is None else (state.time_s, state.position)
+    @classmethod
+    def after(cls, state: DriftState) -> OutlierTest:
+        """The test after a frame that came as expected, with that state."""
+        return cls((state.time_s, state.position))
 
     def explain(
         self, state: DriftState, position: Array, reach: Array, last_s: float
-    ) -> Inflate | None:
+    ) -> tuple[OutlierTest, Inflate | None]:
         """Covariance inflation by which the filter can use an unexpected position.
 
         Parameters
@@ -74,32 +78,32 @@ class OutlierTest:
 
         Returns
         -------
-        None where the position is an outlier.
+        The test from then on, and the inflation; None where the position is an outlier.
         """
         # The same frame may be compared with several keyframes.
-        earlier = tuple(e for e in self._unexpected if e[0] < state.time_s)
-        self._unexpected = (*earlier, (state.time_s, position))[-2:]
+        earlier = tuple(e for e in self.unexpected if e[0] < state.time_s)
+        test = replace(self, unexpected=(*earlier, (state.time_s, position))[-2:])
 
         def is_near(expected: Array) -> bool:
             return bool(np.linalg.norm(np.linalg.solve(reach, position - expected)) <= 1.0)
 
-        since_s = max(state.time_s - (earlier[-1][0] if earlier else last_s), _MIN_INTERVAL_S)
+        since_s = max(state.time_s - (earlier[-1][0] if earlier else last_s), INTERVAL_S_MIN)
         innovation = float(np.sum((position - state.position) ** 2))
         spread = np.eye(2) * innovation
         if is_near(state.position):
-            return _inflate(spread, spread / since_s**2)
+            return test, _inflate(spread, spread / since_s**2)
         if not earlier:
-            return None
+            return test, None
         velocities = [state.velocity]
-        points = earlier if self._expected is None else (self._expected, *earlier)
+        points = earlier if self.expected is None else (self.expected, *earlier)
         if len(points) >= 2:
             (before_s, before), (latest_s, latest) = points[-2:]
-            velocities.append((latest - before) / max(latest_s - before_s, _MIN_INTERVAL_S))
+            velocities.append((latest - before) / max(latest_s - before_s, INTERVAL_S_MIN))
         for velocity in velocities:
             if is_near(earlier[-1][1] + velocity * since_s):
                 change = float(np.sum((velocity - state.velocity) ** 2))
-                return _inflate(spread, reach @ reach.T / since_s**2 + np.eye(2) * change)
-        return None
+                return test, _inflate(spread, reach @ reach.T / since_s**2 + np.eye(2) * change)
+        return test, None
 
 
 def _inflate(position: Array, velocity: Array) -> Inflate:
@@ -121,7 +125,7 @@ def judge_shift(
     last_s: float,
     first_step_px: float,
     max_jump: float,
-) -> Rejection[MatchFailure] | Inflate | None:
+) -> tuple[OutlierTest, Rejection[MatchFailure] | Inflate | None]:
     """Decide whether a measured shift is believed.
 
     Parameters
@@ -151,32 +155,32 @@ def judge_shift(
 
     Returns
     -------
-    Why the shift is not used, or the covariance inflation with which it is, or None where it is
-    used as it is.
+    The test from then on, and why the shift is not used, or the covariance inflation with which it is, or None
+    where it is used as it is.
     """
     expected, _ = state.predict_shift(measure.key)
     x_px, y_px = np.abs(frame.px_from_unit @ (measure.shift[:2] - expected))
     width, height = frame.size
-    is_outlier = nis > GATE
+    is_outlier = nis > INNOVATION_CHI2_MAX
     if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
         reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
-        return Rejection(MatchFailure.STAGE_MOVE, reason)
-    is_far = max(x_px, y_px) > _REACH_SIGMAS * first_step_px
-    if share < _WHOLE and is_far and (is_first or is_outlier):
+        return tests, Rejection(MatchFailure.STAGE_MOVE, reason)
+    is_far = max(x_px, y_px) > REACH_SIGMAS * first_step_px
+    if share < WHOLE_SHARE_MIN and is_far and (is_first or is_outlier):
         reason = f"shift of {100.0 * share:.0f} % of the structure is {np.sqrt(nis):.0f} deviations from the prediction"
-        return Rejection(MatchFailure.OUTLIER, reason)
+        return tests, Rejection(MatchFailure.OUTLIER, reason)
     if is_first or not is_outlier:
-        return None
+        return tests, None
     position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]
     # What moves fast may also turn fast.
     step_px = float(np.hypot(*(frame.px_from_unit @ state.velocity))) * (state.time_s - last_s)
-    reach_px = max(_REACH_SIGMAS * first_step_px, step_px)
+    reach_px = max(REACH_SIGMAS * first_step_px, step_px)
     reach = np.asarray(reach_px * np.linalg.inv(frame.px_from_unit))
-    inflation = tests.explain(state, position, reach, last_s)
+    tests, inflation = tests.explain(state, position, reach, last_s)
     if inflation is None:
         reason = f"shift is {np.sqrt(nis):.0f} deviations from the prediction"
-        return Rejection(MatchFailure.OUTLIER, reason)
-    return inflation
+        return tests, Rejection(MatchFailure.OUTLIER, reason)
+    return tests, inflation
 
 
 def inflate_after_pause(speed: float, pause_s: float) -> Inflate:
@@ -220,7 +224,7 @@ def inflate_if_contradicted(
         return None
     expected, covariance = state.predict_shift(key)
     innovation = nearest - expected
-    if float(innovation @ solve_scaled(covariance, innovation, _DAMPING)) <= GATE:
+    if float(innovation @ solve_scaled(covariance, innovation, DAMPING)) <= INNOVATION_CHI2_MAX:
         return None
     spread = np.eye(2) * float(innovation @ innovation)
     return _inflate(spread, spread / since_s**2)

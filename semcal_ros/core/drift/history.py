@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,29 +24,44 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
-from semcal_ros.core.drift.similarity import SimilarityEstimate, SimilarityTracker, turn_drift
+from semcal_ros.core.drift.similarity import SimilarityEstimate, SimilarityState, turn_drift
 from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.errors import InvalidValueError
+
+
+@dataclass
+class _Stretch:
+    """Frames since the drift was zero: what is known now, and what was known at each of them."""
+
+    filter: DriftFilter
+    similarity: SimilarityState
+    updates: list[DriftUpdate] = field(default_factory=list)
 
 
 class DriftHistory:
     """The frames of a tracker, in stretches that each begin with zero drift."""
 
     def __init__(self) -> None:
-        self._stretches: list[tuple[DriftFilter, SimilarityTracker, list[DriftUpdate]]] = []
+        self._stretches: list[_Stretch] = []
         self._cameras: list[ScanCamera | None] = []
 
     def __len__(self) -> int:
         return len(self._cameras)
 
-    def begin(self, drift_filter: DriftFilter, similarity: SimilarityTracker) -> None:
-        """Begin a new stretch."""
-        self._stretches.append((drift_filter, similarity, []))
-
-    def add(self, update: DriftUpdate, camera: ScanCamera | None) -> None:
-        """Add a frame."""
-        self._stretches[-1][2].append(update)
+    def add(
+        self,
+        update: DriftUpdate,
+        camera: ScanCamera | None,
+        drift_filter: DriftFilter,
+        similarity: SimilarityState,
+    ) -> None:
+        """Add a frame, with the filters after it, which keep all of their events; another start begins a stretch."""
+        if not self._stretches or self._stretches[-1].filter.start is not drift_filter.start:
+            self._stretches.append(_Stretch(drift_filter, similarity))
+        stretch = self._stretches[-1]
+        stretch.filter, stretch.similarity = drift_filter, similarity
+        stretch.updates.append(update)
         self._cameras.append(camera)
 
     def smooth(self) -> DriftPath:
@@ -64,10 +79,11 @@ class DriftHistory:
                 "no frames", expected="at least one", do="track at least one first"
             )
         updates: list[DriftUpdate] = []
-        for drift_filter, similarity, stretch in self._stretches:
+        for stretch in self._stretches:
+            drift_filter, similarity = stretch.filter, stretch.similarity
             if drift_filter.measured == 0:
                 # Nothing to smooth, and the prior is not knowledge.
-                updates.extend(stretch)
+                updates.extend(stretch.updates)
                 continue
             process_noise = drift_filter.process_noise
             if process_noise.psd > 0.0:
@@ -76,8 +92,10 @@ class DriftHistory:
                 )
             states = smooth(drift_filter.start, drift_filter.events, process_noise)
             turns, first_s = similarity.smooth(), drift_filter.start.time_s
-            resolved = _find_resolved(stretch)
-            for k, (update, state, turn) in enumerate(zip(stretch, states, turns, strict=True)):
+            resolved = _find_resolved(stretch.updates)
+            for k, (update, state, turn) in enumerate(
+                zip(stretch.updates, states, turns, strict=True)
+            ):
                 camera = self._cameras[len(updates)]
                 smoothed = _smoothed(update, state, turn, camera)
                 smoothed.covariance[:2, :2] += update.unseen

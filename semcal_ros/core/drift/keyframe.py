@@ -28,16 +28,15 @@ import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
 from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.drift.thresholds import (
+    BLUR_BELOW,
+    COMMON_PX_MIN,
+    PIXEL_SIGMA_PX,
+)
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.fractional_delay import FINE, sample_shifted
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.register import Registration, prepare_reference, to_gray
-
-# Fewer common rows or columns are not added to a mean.
-_MIN_COMMON_PX = 8
-# An image that shrinks by more than this must be blurred first, or it would alias: by a Gaussian
-# that widens 0.45 px, the width of a pixel, to that of a pixel of the new image.
-_BLUR_BELOW, _PIXEL_SIGMA_PX = 0.95, 0.45
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class Keyframe:
             last = min(self.region[axis + 2], region[axis + 2] - high - int(whole[axis]))
             spans.append((first, last))
         (left, right), (top, bottom) = spans
-        if min(right - left, bottom - top) < _MIN_COMMON_PX:
+        if min(right - left, bottom - top) < COMMON_PX_MIN:
             return self
         plain = np.array([1.0])
         # By a gain that the noise of the reference lowers, each mean would have more contrast than the one before.
@@ -175,8 +174,8 @@ def resample_keyframe(key: Keyframe, now: ScanFrame) -> Keyframe:
     offset = np.array([after.px, after.py]) - matrix @ np.array([before.px, before.py])
     shrink = float(np.sqrt(abs(np.linalg.det(matrix))))
     gray = key.mean
-    if shrink < _BLUR_BELOW:
-        sigma = _PIXEL_SIGMA_PX * float(np.sqrt(1.0 / shrink**2 - 1.0))
+    if shrink < BLUR_BELOW:
+        sigma = PIXEL_SIGMA_PX * float(np.sqrt(1.0 / shrink**2 - 1.0))
         gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), sigma), dtype=np.float32)
     warp = np.column_stack([matrix, offset])
     width, height = now.size

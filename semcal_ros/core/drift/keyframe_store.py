@@ -16,25 +16,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.keyframe import Keyframe, resample_keyframe, scale_ratio
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import (
+    CHANGE_MARGIN,
+    MEAN_COUNTS,
+    MERGED_OVERLAP_MIN,
+    SAME_SCALE,
+)
 from semcal_ros.core.registration.reference import Reference, RegistrationSettings
-
-#: Ratio of two scales below which images need no resampling: 0.05 px at the edge of 1024 px.
-SAME_SCALE = 1.0001
-# An old keyframe must overlap by this much more than is asked of the one in use, or two of them
-# would take turns.
-_CHANGE_MARGIN = 0.05
-# Frames are added to a mean where they show most of it.
-_MIN_MERGE_OVERLAP = 0.75
-#: Numbers of frames in a mean at which it replaces the prepared reference: each time its noise
-#: variance has halved. From 32 frames on, it adds 1.5 % to the sigma of a shift.
-MEAN_COUNTS = (2, 4, 8, 16, 32)
 
 
 @dataclass(frozen=True)
@@ -61,39 +56,71 @@ class Candidate:
         return self.ratio > SAME_SCALE
 
 
-class KeyframeStore:
-    """Keyframes by number, with the prepared reference of the one in use.
+@dataclass(frozen=True)
+class PreparedReference:
+    """A reference, and the keyframe ``key`` as it was when it was prepared."""
 
-    Parameters
+    key: int
+    keyframe: Keyframe
+    reference: Reference
+
+    def serves(self, key: int, keyframe: Keyframe) -> bool:
+        """Whether it still is good enough for a keyframe: that has not become much better, or another one."""
+        mine = self.keyframe
+        return (
+            key == self.key
+            and keyframe.averaged >= mine.averaged
+            and keyframe.frame is mine.frame
+            and np.array_equal(keyframe.removed, mine.removed)
+            and not (keyframe.averaged in MEAN_COUNTS and keyframe.averaged > mine.averaged)
+        )
+
+
+@dataclass(frozen=True)
+class KeyframeStore:
+    """Keyframes by number, with the prepared reference of the one in use. What happens to it makes another one, which
+    shares the images.
+
+    Attributes
     ----------
-    settings
-        Settings of the registrations.
-    max_bytes, max_count
-        Memory and number of the keyframes that are kept; the first one is never forgotten.
+    keyframes
+        The keyframes by number, in the order of their last use.
+    current
+        Number of the one in use.
+    first
+        Number of the one that is never forgotten.
+    following
+        Number of the next one.
+    prepared
+        The latest reference.
+    resampled
+        The latest reference of another scale, and the frame whose camera would show it so.
     """
 
-    def __init__(self, settings: RegistrationSettings, max_bytes: int, max_count: int) -> None:
-        self._settings = settings
-        self._max_bytes, self._max_count = max_bytes, max_count
-        self._keyframes: dict[int, Keyframe] = {}
-        self._prepared: tuple[int, Keyframe, Reference] | None = None
-        self._resampled: tuple[Keyframe, ScanFrame, Reference] | None = None
-        self._first: int | None = None
-        self._next = 0
-        self.current: int | None = None
+    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    current: int | None = None
+    first: int | None = None
+    following: int = 0
+    prepared: PreparedReference | None = None
+    resampled: tuple[PreparedReference, ScanFrame] | None = None
 
     def __getitem__(self, key: int) -> Keyframe:
-        return self._keyframes[key]
+        return self.keyframes[key]
 
     @property
     def keys(self) -> tuple[int, ...]:
         """Numbers of the keyframes."""
-        return tuple(self._keyframes)
+        return tuple(self.keyframes)
 
     def __len__(self) -> int:
-        return len(self._keyframes)
+        return len(self.keyframes)
 
-    def add(self, keyframe: Keyframe, reference: Reference | None = None) -> tuple[int, list[int]]:
+    @property
+    def latest(self) -> int:
+        """Number of the keyframe that was added last."""
+        return self.following - 1
+
+    def add(self, keyframe: Keyframe, reference: Reference | None = None) -> KeyframeStore:
         """Add a keyframe and make it the one in use.
 
         Parameters
@@ -102,93 +129,84 @@ class KeyframeStore:
             The keyframe.
         reference
             Its prepared reference, where that exists already.
-
-        Returns
-        -------
-        Its number, and those of the keyframes that were forgotten for it.
         """
-        number = self._next
-        self._next += 1
-        self._first = number if self._first is None else self._first
-        self._keyframes[number] = keyframe
-        self.current = number
+        number = self.following
+        prepared = self.prepared
         if reference is not None:
-            self._prepared = number, keyframe, reference
-        return number, self._forget_oldest()
+            prepared = PreparedReference(number, keyframe, reference)
+        return replace(
+            self,
+            keyframes={**self.keyframes, number: keyframe},
+            current=number,
+            first=number if self.first is None else self.first,
+            following=number + 1,
+            prepared=prepared,
+        )
 
-    def _forget_oldest(self) -> list[int]:
-        gone = []
-        while len(self._keyframes) > 2 and (
-            len(self._keyframes) > self._max_count
-            or sum(k.nbytes for k in self._keyframes.values()) > self._max_bytes
+    def superfluous(self, max_bytes: int, max_count: int) -> list[int]:
+        """Numbers of the keyframes to forget, so that memory and number of the others stay within their limits: those
+        that were not used for the longest time, and never the first one.
+        """
+        left, gone = dict(self.keyframes), []
+        while len(left) > 2 and (
+            len(left) > max_count or sum(k.nbytes for k in left.values()) > max_bytes
         ):
-            # The order is that of the last use.
-            oldest = next(k for k in self._keyframes if k not in (self._first, self.current))
-            del self._keyframes[oldest]
+            oldest = next(k for k in left if k not in (self.first, self.current))
+            del left[oldest]
             gone.append(oldest)
         return gone
 
-    def forget(self, key: int) -> None:
+    def forget(self, key: int) -> KeyframeStore:
         """Remove a keyframe."""
-        del self._keyframes[key]
-        if self._first == key:
-            self._first = next(iter(self._keyframes), None)
+        rest = {k: keyframe for k, keyframe in self.keyframes.items() if k != key}
+        first = next(iter(rest), None) if self.first == key else self.first
+        return replace(self, keyframes=rest, first=first)
 
-    def use(self, key: int) -> None:
+    def use(self, key: int) -> KeyframeStore:
         """Make it the one in use."""
-        self.current = key
-        self._keyframes[key] = self._keyframes.pop(key)
+        others = {k: keyframe for k, keyframe in self.keyframes.items() if k != key}
+        return replace(self, keyframes={**others, key: self.keyframes[key]}, current=key)
 
-    def replace(self, key: int, keyframe: Keyframe) -> None:
+    def replace(self, key: int, keyframe: Keyframe) -> KeyframeStore:
         """Replace a keyframe under the same number."""
-        self._keyframes[key] = keyframe
+        return replace(self, keyframes={**self.keyframes, key: keyframe})
 
-    def reference(self, key: int) -> Reference:
-        """The prepared reference; it is kept until another one is asked for, or until the mean has
-        become much better.
+    def reference(
+        self, key: int, settings: RegistrationSettings
+    ) -> tuple[KeyframeStore, Reference]:
+        """The prepared reference of a keyframe, and the store that keeps it until another one is asked for, or until
+        the mean has become much better.
         """
-        keyframe = self._keyframes[key]
-        latest = self._prepared
-        if latest is None or latest[0] != key or self._is_outdated(latest[1], keyframe):
-            latest = key, keyframe, keyframe.prepare_reference(self._settings)
-            self._prepared = latest
-        return latest[2]
-
-    def _is_outdated(self, before: Keyframe, now: Keyframe) -> bool:
-        """Whether a keyframe has become much better than the one that was prepared, or another one."""
-        if now.averaged < before.averaged:
-            return True
-        if before.frame is not now.frame or not np.array_equal(before.removed, now.removed):
-            return True
-        return now.averaged in MEAN_COUNTS and now.averaged > before.averaged
+        keyframe, latest = self.keyframes[key], self.prepared
+        if latest is None or not latest.serves(key, keyframe):
+            latest = PreparedReference(key, keyframe, keyframe.prepare_reference(settings))
+        return replace(self, prepared=latest), latest.reference
 
     def averaged(self, key: int) -> int:
         """Number of frames in the prepared reference."""
-        if self._prepared is not None and self._prepared[0] == key:
-            return self._prepared[1].averaged
-        return self._keyframes[key].averaged
+        if self.prepared is not None and self.prepared.key == key:
+            return self.prepared.keyframe.averaged
+        return self.keyframes[key].averaged
 
     def has_room(self, key: int, overlap: float) -> bool:
         """Whether a frame with that overlap would make the mean of a keyframe better."""
-        return self._keyframes[key].averaged < MEAN_COUNTS[-1] and overlap >= _MIN_MERGE_OVERLAP
+        return self.keyframes[key].averaged < MEAN_COUNTS[-1] and overlap >= MERGED_OVERLAP_MIN
 
-    def resampled_reference(self, key: int, frame: ScanFrame) -> Reference:
-        """The reference as the camera of a frame would show it; the latest one is kept, because a
-        frame may be registered several times.
+    def resampled_reference(
+        self, key: int, frame: ScanFrame, settings: RegistrationSettings
+    ) -> tuple[KeyframeStore, Reference]:
+        """The reference as the camera of a frame would show the keyframe, and the store that keeps it, because a frame
+        may be registered several times.
         """
-        keyframe, latest = self._keyframes[key], self._resampled
-        if latest is None or latest[0] is not keyframe or latest[1] is not frame:
-            latest = (
-                keyframe,
-                frame,
-                resample_keyframe(keyframe, frame).prepare_reference(self._settings),
-            )
-            self._resampled = latest
-        return latest[2]
+        keyframe, latest = self.keyframes[key], self.resampled
+        if latest is None or latest[0].keyframe is not keyframe or latest[1] is not frame:
+            reference = resample_keyframe(keyframe, frame).prepare_reference(settings)
+            latest = PreparedReference(key, keyframe, reference), frame
+        return replace(self, resampled=latest), latest[0].reference
 
     def smallest_scale_ratio(self, frame: ScanFrame) -> float:
         """Factor by which the scale of a frame differs from that of the most similar keyframe."""
-        return min(scale_ratio(k.frame, frame) for k in self._keyframes.values())
+        return min(scale_ratio(k.frame, frame) for k in self.keyframes.values())
 
     def candidates(
         self, state: DriftState, frame: ScanFrame, enough: float, max_ratio: float
@@ -199,7 +217,7 @@ class KeyframeStore:
         more; then those of another scale, up to a factor of ``max_ratio``.
         """
         candidates = []
-        for key, keyframe in self._keyframes.items():
+        for key, keyframe in self.keyframes.items():
             ratio = scale_ratio(keyframe.frame, frame)
             if ratio <= max_ratio and key in state.keys:
                 shift = frame.px_from_unit @ (state.position - state.keyframe_state(key)[:2])
@@ -208,7 +226,7 @@ class KeyframeStore:
 
         def rank(candidate: Candidate) -> tuple[bool, bool, float]:
             in_use = candidate.key == self.current
-            good = candidate.overlap >= enough + (0.0 if in_use else _CHANGE_MARGIN)
+            good = candidate.overlap >= enough + (0.0 if in_use else CHANGE_MARGIN)
             return candidate.rescaled, not (in_use and good), -candidate.overlap
 
         return sorted(candidates, key=rank)

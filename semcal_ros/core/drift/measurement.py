@@ -29,20 +29,16 @@ from semcal_ros.core.drift.camera_uncertainty import (
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.operations import CloneKeyframe, Measure
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import (
+    DISTORTION_OF_SCALE,
+    SHEAR_COPY_NOISE,
+    SHEAR_FLOOR_PX,
+    SHEAR_LEFT_PX,
+    SHEAR_MAX,
+    SHEAR_OF_SHIFT,
+    SHIFT_FLOOR_PX,
+)
 from semcal_ros.core.registration.register import Registration
-
-# Errors that the scatter of the tiles does not show, 1-sigma: of a shift (interpolation), of a shear
-# (one linear step leads to it), and of a shear as a part of the shift (distortion; a calibration
-# whose scale is less certain leaves more).
-_SHIFT_FLOOR_PX = 1e-3
-_SHEAR_FLOOR_PX = 0.02
-_SHEAR_OF_SHIFT = 1e-3
-# A distortion is this part of the relative error of the scale.
-_DISTORTION_OF_SCALE = 1.0 / 3.0
-# The shear that a wrong velocity leaves in a frame is worth another registration from here on.
-_MAX_SHEAR_PX = 0.1
-# Part of the variance of a measured shear by which that of the keyframe differs from it.
-_SHEAR_COPY_NOISE = 0.01
 
 
 def exceeds_tolerance(motion: Array, frame: ScanFrame) -> bool:
@@ -52,7 +48,15 @@ def exceeds_tolerance(motion: Array, frame: ScanFrame) -> bool:
     time_s = frame.timing.frame_time_s
     shear_px = np.abs(frame.px_from_unit @ motion[:2]) * time_s
     bend_px = np.abs(frame.px_from_unit @ motion[2:]) * time_s**2 / 8.0
-    return float(np.max(np.maximum(shear_px, bend_px))) > _MAX_SHEAR_PX
+    return float(np.max(np.maximum(shear_px, bend_px))) > SHEAR_LEFT_PX
+
+
+def is_removable(motion: Array, frame: ScanFrame) -> bool:
+    """Whether a motion, of which the first two numbers are a velocity, can be that of a specimen during a frame."""
+    if frame.timing is None:
+        return True
+    shear_px = np.abs(frame.px_from_unit @ motion[:2]) * frame.timing.frame_time_s
+    return float(np.max(shear_px)) <= SHEAR_MAX * frame.size[1]
 
 
 def make_measurement(
@@ -81,7 +85,7 @@ def make_measurement(
     """
     unit = np.linalg.inv(now.px_from_unit)
     share = averaged / (averaged + 1.0) if np.isfinite(averaged) else 1.0
-    covariance = share * registration.covariance + np.eye(2) * _SHIFT_FLOOR_PX**2
+    covariance = share * registration.covariance + np.eye(2) * SHIFT_FLOOR_PX**2
     term_s2, scan_s = now.acceleration_term_s2, now.acquisition_time_s
     if now.timing is None or not np.all(np.isfinite(registration.alignment.joint_px)):
         shift = unit @ registration.shift_px + term_s2 * removed[2:]
@@ -90,10 +94,10 @@ def make_measurement(
         )
     frame_s = now.timing.frame_time_s
     both = np.kron(np.diag([1.0, 1.0 / frame_s]), unit)
-    part = max(_SHEAR_OF_SHIFT, _DISTORTION_OF_SCALE * relative_scale_sigma(now.camera))
+    part = max(SHEAR_OF_SHIFT, DISTORTION_OF_SCALE * relative_scale_sigma(now.camera))
     distance = float(np.hypot(*registration.shift_px))
-    shear_floor = _SHEAR_FLOOR_PX**2 + (part * distance) ** 2
-    floor = np.diag([_SHIFT_FLOOR_PX**2] * 2 + [shear_floor] * 2)
+    shear_floor = SHEAR_FLOOR_PX**2 + (part * distance) ** 2
+    floor = np.diag([SHIFT_FLOOR_PX**2] * 2 + [shear_floor] * 2)
     joint = share * registration.alignment.joint_covariance + floor
     shift = both @ registration.alignment.joint_px + np.append(term_s2 * removed[2:], removed[:2])
     ratio = 1.0 if before.timing is None else before.timing.frame_time_s / frame_s
@@ -132,7 +136,7 @@ def clone_keyframe(
     bend = measure.acceleration_term_s2 * removed[2:]
     if measure.shift.size == 4:
         shift = measure.shift - np.append(bend, removed[:2])
-        full[2:, 2:] = measure.covariance[2:, 2:] * _SHEAR_COPY_NOISE
+        full[2:, 2:] = measure.covariance[2:, 2:] * SHEAR_COPY_NOISE
     else:
         shift = np.append(measure.shift - bend, np.zeros(2))
         full[2:, 2:] = state.drift_covariance[2:, 2:]

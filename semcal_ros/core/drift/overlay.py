@@ -24,21 +24,25 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.drift.thresholds import (
+    OVERLAY_CLIPPED_MIN,
+    OVERLAY_ENLARGED_PX,
+    OVERLAY_FILLED_PX,
+    OVERLAY_LINE_PX,
+    OVERLAY_NEAR_MIN,
+    OVERLAY_NOISE_MIN,
+    OVERLAY_PIXELS_MIN,
+    OVERLAY_SAME_MAX,
+    OVERLAY_SIGMAS,
+    OVERLAY_TEXT_PX,
+)
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 
-# Windows (width, height), px, for text and for lines, in which pixels are counted that are the same in both pictures,
-# and by how many standard deviations of a binomial law there must be more than elsewhere: by chance, once in 10^9.
-_WINDOWS, _MORE_SIGMAS = ((9, 9), (21, 1), (1, 21)), 6.0
-# At least so many of them in a window, and in a picture.
-_LEAST_NEAR, _LEAST_PIXELS = 12, 60
-# How many of the pixels of a line must be the same where they may be clipped.
-_LEAST_LINE = 19
-# Less noise leaves pixels the same by chance; grey levels.
-_LEAST_NOISE = 1.5
-# Part of all pixels that may be the same: more is a picture that came again.
-_MOST_SAME = 0.6
-# By how much an overlay is enlarged, and the side of the square from which its place is filled, px.
-_ENLARGED_PX, _FILLED_PX = 2, 21
+_WINDOWS = (
+    (OVERLAY_TEXT_PX, OVERLAY_TEXT_PX),
+    (OVERLAY_LINE_PX, 1),
+    (1, OVERLAY_LINE_PX),
+)
 
 
 def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
@@ -52,11 +56,11 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     if now.ndim == 3:
         before, now = before[..., 1], now[..., 1]
     same = before == now
-    if float(same.mean()) > _MOST_SAME:
+    if float(same.mean()) > OVERLAY_SAME_MAX:
         return None
     some = now[::3, ::3].astype(np.float32) - before[::3, ::3].astype(np.float32)
     noise = 1.4826 * float(np.median(np.abs(some))) / np.sqrt(2.0)
-    if noise < _LEAST_NOISE:
+    if noise < OVERLAY_NOISE_MIN:
         return None
     # Of the least and the largest grey level, to which parts of a specimen are clipped, only straight lines count.
     drawn = same & ((now == now.min()) | (now == now.max()))
@@ -65,22 +69,22 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     core, counted = np.zeros_like(same), same.astype(np.uint8)
     for window in _WINDOWS:
         pixels = window[0] * window[1]
-        expected = pixels * rate + _MORE_SIGMAS * np.sqrt(pixels * rate * (1.0 - rate))
+        expected = pixels * rate + OVERLAY_SIGMAS * np.sqrt(pixels * rate * (1.0 - rate))
         near = cv2.boxFilter(counted, cv2.CV_16U, window, normalize=False)
-        core |= same & (near >= max(expected, _LEAST_NEAR))
+        core |= same & (near >= max(expected, OVERLAY_NEAR_MIN))
         if 1 in window and np.any(drawn):
             line = cv2.boxFilter(drawn.astype(np.uint8), cv2.CV_16U, window, normalize=False)
-            core |= drawn & (line >= _LEAST_LINE)
-    if np.count_nonzero(core) < _LEAST_PIXELS:
+            core |= drawn & (line >= OVERLAY_CLIPPED_MIN)
+    if np.count_nonzero(core) < OVERLAY_PIXELS_MIN:
         return None
-    return grow_mask(core, _ENLARGED_PX)
+    return grow_mask(core, OVERLAY_ENLARGED_PX)
 
 
 def remove_overlay(image: AnyImage, overlay: Mask) -> AnyImage:
     """The picture (h, w) or (h, w, 3) with the mean of what lies around in the place of an overlay."""
     channels: list[Array] = []
     seen = (~overlay).astype(np.float32)
-    size = (_FILLED_PX, _FILLED_PX)
+    size = (OVERLAY_FILLED_PX, OVERLAY_FILLED_PX)
     share = cv2.boxFilter(seen, cv2.CV_32F, size)
     for channel in np.moveaxis(np.atleast_3d(image), 2, 0):
         level = channel.astype(np.float32)

@@ -22,12 +22,39 @@ How much of the ground is still among them is told by a second look, with a ring
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
+from semcal_ros.core.drift.thresholds import (
+    APART_PX_MIN,
+    APART_SIGMAS,
+    BODY_BEYOND_PX,
+    BODY_DISAGREES,
+    BODY_FLOOR_PX,
+    BODY_FRAMES_MAX,
+    BODY_GAINS,
+    BODY_GAP_PX,
+    BODY_HALVES_SIGMAS,
+    BODY_LEFT_MAX,
+    BODY_MARGIN_PX,
+    BODY_PIXELS_MIN,
+    BODY_REACH_PX,
+    BODY_REST_FRAMES,
+    BODY_REST_FRAMES_MAX,
+    BODY_SEARCHES,
+    BODY_SIDE_PX_MIN,
+    BODY_SIGMA_PX_MAX,
+    BODY_SMOOTHED_PX,
+    BODY_SQUARE_PX,
+    CONFIRMED_PX,
+    CONFIRMED_SIGMAS,
+    PART_OF_RING,
+    RING_PX,
+    TILE_PIXELS_MIN,
+)
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import MovingTiles, fill_bodies
 from semcal_ros.core.registration.fixed_pixels import grow_mask
@@ -40,35 +67,6 @@ from semcal_ros.core.registration.noise_spectrum import (
 from semcal_ros.core.registration.reference import Region
 from semcal_ros.core.registration.register import to_gray
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel, drop_pixels, make_level
-
-# By how much a body must have moved against the specimen, px, before its pixels are told from those of the ground;
-# frames after which a slower one is compared all the same, and frames without a measurement after each: it takes as
-# long as the drift of a frame without a tool.
-_LEAST_APART_PX, _MOST_FRAMES, _REST_FRAMES = 1.5, 12, 3
-# Frames after which a body is searched for, and the longest rest after it was not found again and again.
-_SEARCHES, _LONGEST_REST = (1, 3, 6), 24
-# How far a body whose motion is not known yet may have moved between two frames, and others beyond the expected, px.
-_REACH_PX, _BEYOND_PX = 16, 3.0
-# What is compared around a body, and the least side of it: tiles need some 50 px.
-_MARGIN_PX, _LEAST_SIDE_PX = 10, 48
-# Smoothing of both images, px, and the squared difference over that of the noise from which a square of 3 px
-# disagrees: of some two independent differences, one in 400. Single squares are no body.
-_SMOOTHED_PX, _DISAGREES, _SQUARE_PX, _LEAST_PIXELS = 1.0, 6.0, 3, 40
-# What confirms a measurement: one before that differs by less than so many deviations, or px between two frames.
-_CONFIRMED_SIGMAS, _CHANGE_PX = 3.0, 0.3
-# Gaps in the outline of a body up to which it is one, px.
-_GAP_PX = 7
-# Pixels of a tile that make it count.
-_LEAST_OF_TILE = 8
-# Width of the ring of the second look, px, and which part of what it changes the ground may have pulled the first look
-# by: the pixels that were taken for the body reach some 2 px beyond its edge. Found by drawn bodies, whose errors are
-# then 0.5 to 1.3 of the stated sigma.
-_RING_PX, _PART_OF_RING = 3, 0.6
-# Errors of interpolation at an edge, px.
-_FLOOR_PX = 0.02
-# A body shows itself again as bright, without much else, in its halves alike, and moves otherwise than the ground. A
-# larger sigma, px, is that of something else: a body that turns, two bodies, or a shadow.
-_GAINS, _MOST_LEFT, _HALF_SIGMAS, _APART_SIGMAS, _MOST_SIGMA_PX = (0.9, 1.1), 5.0, 4.0, 3.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -120,66 +118,75 @@ class BodyFrame:
     time_s: float
 
 
+@dataclass(frozen=True)
 class OwnMotionEstimator:
-    """Measures the own motion of a body, from one frame to a later one again and again."""
+    """Measures the own motion of a body, from one frame to a later one again and again. Each frame makes another one.
 
-    def __init__(self) -> None:
-        self._base: BodyFrame | None = None
-        self._since = 0
-        self._rest = 0
-        self._failures = 0
-        self._guess: OwnMotion | None = None
-        self._latest: OwnMotion | None = None
+    Attributes
+    ----------
+    latest
+        The motion as it was measured last; None where it is not known, or nothing moves.
+    guess
+        Where to look the next time: as ``latest``, or a first measurement, whose start was searched for.
+    base
+        The frame from which it is measured next.
+    since
+        Number of frames since then.
+    rest
+        Number of frames to wait for the next one to measure from.
+    failures
+        Number of measurements in a row that failed.
+    """
 
-    def update(self, frame: BodyFrame | None) -> OwnMotion | None:
-        """The motion as it was measured last; None where it is not known, or nothing moves (``frame`` is None).
+    latest: OwnMotion | None = None
+    guess: OwnMotion | None = None
+    base: BodyFrame | None = None
+    since: int = 0
+    rest: int = 0
+    failures: int = 0
 
-        The first measurement, whose start was searched for, only tells where to look the next time.
-        """
+    def update(self, frame: BodyFrame | None) -> OwnMotionEstimator:
+        """The estimator after a frame; None where nothing moves."""
         if frame is None:
-            self._base = self._guess = self._latest = None
-            self._since = self._rest = self._failures = 0
-            return None
-        base = self._base
+            return OwnMotionEstimator()
+        base = self.base
         if base is None or not _are_comparable(base, frame):
+            waiting = replace(self, rest=self.rest - 1)
             if base is not None:
-                self._guess = self._latest = None
-            self._rest -= 1
-            if self._rest <= 0:
-                self._base, self._since = _keep(frame), 0
-            return self._latest
-        self._since += 1
+                waiting = replace(waiting, guess=None, latest=None)
+            if waiting.rest > 0:
+                return waiting
+            return replace(waiting, base=_keep(frame), since=0)
+        later = replace(self, since=self.since + 1)
         interval_s = frame.time_s - base.time_s
         moved_px = frame.px_from_unit @ (frame.drift - base.drift)
         expected_px = None
-        if self._guess is not None:
-            expected_px = interval_s * (frame.px_from_unit @ self._guess.velocity_m_s)
-            is_near = float(np.hypot(*(expected_px - moved_px))) < _LEAST_APART_PX
-            if is_near and self._since < _MOST_FRAMES:
-                return self._latest
-        elif self._since not in _SEARCHES:
-            return None
+        if self.guess is not None:
+            expected_px = interval_s * (frame.px_from_unit @ self.guess.velocity_m_s)
+            is_near = float(np.hypot(*(expected_px - moved_px))) < APART_PX_MIN
+            if is_near and later.since < BODY_FRAMES_MAX:
+                return later
+        elif later.since not in BODY_SEARCHES:
+            return later
         found = measure_displacement(base, frame, moved_px, expected_px)
-        if found is None and expected_px is None and self._since < _SEARCHES[-1]:
-            # It may be a slow one.
-            return None
-        before, self._guess, self._latest = self._guess, None, None
-        if found is not None:
-            unit_from_px = np.linalg.inv(frame.px_from_unit) / interval_s
-            displacement, covariance = found
-            self._guess = OwnMotion(
-                unit_from_px @ displacement,
-                unit_from_px @ covariance @ unit_from_px.T,
-                base.time_s,
-                frame.time_s,
-            )
-            if before is not None and _is_confirmed(before, self._guess, interval_s, frame):
-                self._latest = self._guess
-        self._failures = self._failures + 1 if found is None else 0
-        self._base, self._rest = None, 0 if self._latest is None else _REST_FRAMES
         if found is None:
-            self._rest = min(_REST_FRAMES * 2**self._failures, _LONGEST_REST)
-        return self._latest
+            if expected_px is None and later.since < BODY_SEARCHES[-1]:
+                # It may be a slow one.
+                return later
+            failures = self.failures + 1
+            rest = min(BODY_REST_FRAMES * 2**failures, BODY_REST_FRAMES_MAX)
+            return OwnMotionEstimator(since=later.since, rest=rest, failures=failures)
+        unit_from_px = np.linalg.inv(frame.px_from_unit) / interval_s
+        displacement, covariance = found
+        guess = OwnMotion(
+            unit_from_px @ displacement,
+            unit_from_px @ covariance @ unit_from_px.T,
+            base.time_s,
+            frame.time_s,
+        )
+        if self.guess is not None and _is_confirmed(self.guess, guess, interval_s, frame):
+            return OwnMotionEstimator(guess, guess, since=later.since, rest=BODY_REST_FRAMES)
+        return OwnMotionEstimator(guess=guess, since=later.since)
 
 
 def _is_confirmed(before: OwnMotion, now: OwnMotion, interval_s: float, frame: BodyFrame) -> bool:
@@ -187,8 +194,8 @@ def _is_confirmed(before: OwnMotion, now: OwnMotion, interval_s: float, frame: B
     change = now.velocity_m_s - before.velocity_m_s
     spread = before.covariance + now.covariance
     distance = float(np.hypot(*(interval_s * (frame.px_from_unit @ change))))
-    return distance < _CHANGE_PX or (
-        float(change @ np.linalg.solve(spread, change)) < _CONFIRMED_SIGMAS**2
+    return distance < CONFIRMED_PX or (
+        float(change @ np.linalg.solve(spread, change)) < CONFIRMED_SIGMAS**2
     )
 
 
@@ -236,7 +243,7 @@ def measure_displacement(
         return None
     cut, inside = body
     left, top, right, bottom = cut
-    reach = _REACH_PX + _MARGIN_PX
+    reach = BODY_REACH_PX + BODY_MARGIN_PX
     wide = (
         max(left - reach, now.region[0]),
         max(top - reach, now.region[1]),
@@ -244,52 +251,54 @@ def measure_displacement(
         min(bottom + reach, now.region[3]),
     )
     first, second = _cut(before.image, cut), _cut(now.image, wide)
-    if min(second.shape) < _LEAST_SIDE_PX:
+    if min(second.shape) < BODY_SIDE_PX_MIN:
         return None
     noise = estimate_noise_variance(to_gray(now.image))
-    smoothed = passed_variance(_SMOOTHED_PX) * noise
+    smoothed = passed_variance(BODY_SMOOTHED_PX) * noise
     pair = _Pair(
-        smooth(first, _SMOOTHED_PX),
-        smooth(second, _SMOOTHED_PX),
+        smooth(first, BODY_SMOOTHED_PX),
+        smooth(second, BODY_SMOOTHED_PX),
         np.subtract(cut[:2], wide[:2]).astype(np.float64),
     )
     as_ground = pair.compare(moved_px)
-    evidence = inside & (as_ground > _DISAGREES * 2.0 * smoothed)
-    if np.count_nonzero(evidence) < _LEAST_PIXELS:
+    evidence = inside & (as_ground > BODY_DISAGREES * 2.0 * smoothed)
+    if np.count_nonzero(evidence) < BODY_PIXELS_MIN:
         return None
     start = pair.search(evidence) if expected_px is None else expected_px
-    level = make_level(Pyramid(first), 1, _SMOOTHED_PX)
+    level = make_level(Pyramid(first), 1, BODY_SMOOTHED_PX)
     if level is None or start is None:
         return None
     shift, looks, image = start, [], Pyramid(second)
     mask = evidence
-    for ring in (0, 0, _RING_PX):
+    for ring in (0, 0, RING_PX):
         if not ring:
-            mask = inside & fill_bodies(evidence & (pair.compare(shift) < as_ground), _GAP_PX)
+            mask = inside & fill_bodies(evidence & (pair.compare(shift) < as_ground), BODY_GAP_PX)
         found = _align(level, image, grow_mask(mask, ring), shift + pair.offset, smoothed)
         if found is None:
             return None
         looks.append(found)
         if not ring:
             shift = found.shift_px - pair.offset
-            if np.max(np.abs(shift - start)) > _BEYOND_PX:
+            if np.max(np.abs(shift - start)) > BODY_BEYOND_PX:
                 return None
     best = looks[1]
-    by_ring = _PART_OF_RING * (looks[2].shift_px - best.shift_px)
-    covariance = best.covariance + np.diag(by_ring**2 + _FLOOR_PX**2)
+    by_ring = PART_OF_RING * (looks[2].shift_px - best.shift_px)
+    covariance = best.covariance + np.diag(by_ring**2 + BODY_FLOOR_PX**2)
     return (shift, covariance) if _is_body(best, covariance, shift - moved_px, smoothed) else None
 
 
 def _is_body(alignment: Alignment, covariance: Array, apart_px: Array, smoothed: float) -> bool:
     """Whether what was aligned is one body that moves apart from the specimen."""
     sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance))))
-    halves = np.abs(alignment.half_difference_px) > _HALF_SIGMAS * np.sqrt(alignment.half_variance)
+    halves = np.abs(alignment.half_difference_px) > BODY_HALVES_SIGMAS * np.sqrt(
+        alignment.half_variance
+    )
     return (
-        sigma <= _MOST_SIGMA_PX
-        and _GAINS[0] < alignment.gain < _GAINS[1]
-        and alignment.residual_rms**2 < _MOST_LEFT * 2.0 * smoothed
+        sigma <= BODY_SIGMA_PX_MAX
+        and BODY_GAINS[0] < alignment.gain < BODY_GAINS[1]
+        and alignment.residual_rms**2 < BODY_LEFT_MAX * 2.0 * smoothed
         and not np.any(halves)
-        and float(apart_px @ np.linalg.solve(covariance, apart_px)) > _APART_SIGMAS**2
+        and float(apart_px @ np.linalg.solve(covariance, apart_px)) > APART_SIGMAS**2
     )
 
 
@@ -306,9 +315,9 @@ def _find_body(frame: BodyFrame) -> tuple[Region, Mask] | None:
     spans = []
     for axis, begin, length in ((0, col, cols), (1, row, rows)):
         corner, side = float(frame.moving.corner_px[axis]), float(frame.moving.side_px[axis])
-        low = corner + side * (begin - 1) - _MARGIN_PX
-        high = corner + side * (begin + length + 1) + _MARGIN_PX
-        short = max(0.0, _LEAST_SIDE_PX - (high - low))
+        low = corner + side * (begin - 1) - BODY_MARGIN_PX
+        high = corner + side * (begin + length + 1) + BODY_MARGIN_PX
+        short = max(0.0, BODY_SIDE_PX_MIN - (high - low))
         spans.append(
             (
                 max(int(np.floor(low - 0.5 * short)), frame.region[axis]),
@@ -316,7 +325,7 @@ def _find_body(frame: BodyFrame) -> tuple[Region, Mask] | None:
             )
         )
     (left, right), (top, bottom) = spans
-    if min(right - left, bottom - top) < _LEAST_SIDE_PX:
+    if min(right - left, bottom - top) < BODY_SIDE_PX_MIN:
         return None
     only = MovingTiles(labels == largest, frame.moving.corner_px, frame.moving.side_px, 0.0)
     x, y = np.arange(left, right, dtype=np.float64), np.arange(top, bottom, dtype=np.float64)
@@ -347,7 +356,7 @@ class _Pair:
             flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        size = (_SQUARE_PX, _SQUARE_PX)
+        size = (BODY_SQUARE_PX, BODY_SQUARE_PX)
         return np.asarray(cv2.boxFilter((there - self.first) ** 2, cv2.CV_32F, size))
 
     def search(self, mask: Mask) -> Array | None:
@@ -356,8 +365,8 @@ class _Pair:
         part = slice(rows[0], rows[-1] + 1, 2), slice(cols[0], cols[-1] + 1, 2)
         template = np.ascontiguousarray(self.first[part])
         weight = np.ascontiguousarray(mask[part], dtype=np.float32)
-        low = np.array([cols[0], rows[0]]) + self.offset - _REACH_PX
-        size = 2 * np.array(template.shape[::-1]) + 2 * _REACH_PX
+        low = np.array([cols[0], rows[0]]) + self.offset - BODY_REACH_PX
+        size = 2 * np.array(template.shape[::-1]) + 2 * BODY_REACH_PX
         warp = np.array([[2.0, 0.0, low[0]], [0.0, 2.0, low[1]]])
         wide = cv2.warpAffine(
             self.second,
@@ -370,7 +379,7 @@ class _Pair:
         if not np.all(np.isfinite(found)):
             return None
         row, col = np.unravel_index(int(np.argmin(found)), found.shape)
-        return 2.0 * np.array([col, row], dtype=np.float64) - _REACH_PX
+        return 2.0 * np.array([col, row], dtype=np.float64) - BODY_REACH_PX
 
 
 def _align(
@@ -378,7 +387,7 @@ def _align(
 ) -> Alignment | None:
     """Refine a shift by the pixels of a mask alone."""
     part = drop_pixels(level, ~mask)
-    counts = np.asarray(part.normal_matrices[..., 3, 3] >= _LEAST_OF_TILE, dtype=np.float64)
+    counts = np.asarray(part.normal_matrices[..., 3, 3] >= TILE_PIXELS_MIN, dtype=np.float64)
     found = align_reweighted(
         part,
         image,

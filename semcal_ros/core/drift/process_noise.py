@@ -26,6 +26,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.drift.thresholds import (
+    MEAN_POSITION_VARIANCE,
+    MEAN_VELOCITY_VARIANCE,
+    QUADRATURE_SPAN_MAX,
+    SERIES_BELOW,
+)
 
 # The noise of a step is a Gauss-Legendre quadrature over the impulse responses; this order is exact
 # to rounding up to 4 time constants, and longer steps are made by doubling. Van Loan's matrix
@@ -34,15 +40,8 @@ from semcal_ros.core.arrays import Array
 # with scipy's expm it takes four times as long (1.0 instead of 0.25 ms, and it is needed for each
 # frame).
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-_MAX_TIME_CONSTANTS = 4.0
 # Fractions of a step at which the impulse response is needed: the nodes, and its end.
 _FRACTIONS = np.append(0.5 * (_NODES + 1.0), 1.0)
-# The mean position and the mean velocity over an acquisition of A seconds, given position, velocity
-# and acceleration at its middle, have these variances for a white acceleration of density q:
-# q A^3 / 320 and q A / 12, integrals over the impulse responses of both halves.
-_MEAN_POSITION, _MEAN_VELOCITY = 1.0 / 320.0, 1.0 / 12.0
-# Below this part of a time constant the difference of exponentials is a series of three terms.
-_SERIES_BELOW = 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,10 @@ class ProcessNoise:
         psd = self.psd
         if self.time_constant_s > 0.0:
             psd *= min(1.0, 0.5 * scan_s / self.time_constant_s)
-        variances = [psd * scan_s**3 * _MEAN_POSITION, psd * scan_s * _MEAN_VELOCITY]
+        variances = [
+            psd * scan_s**3 * MEAN_POSITION_VARIANCE,
+            psd * scan_s * MEAN_VELOCITY_VARIANCE,
+        ]
         return np.diag(np.repeat(variances, 2) + np.array([0.0, 0.0, *self.flicker[2:]]))
 
     def discretise(self, dt_s: float) -> tuple[Array, Array]:
@@ -102,7 +104,7 @@ class ProcessNoise:
             return transition, noise * self.psd
         rate = 1.0 / self.time_constant_s
         time_constants = max(dt_s * rate, 1e-300)
-        doublings = max(0, int(np.ceil(np.log2(time_constants / _MAX_TIME_CONSTANTS))))
+        doublings = max(0, int(np.ceil(np.log2(time_constants / QUADRATURE_SPAN_MAX))))
         step_s = dt_s / 2.0**doublings
         responses = _impulse_response(step_s * _FRACTIONS, rate)
         transition = np.eye(3)
@@ -123,7 +125,7 @@ def _impulse_response(time_s: Array, rate: float) -> Array:
     """
     decay = np.expm1(-rate * time_s)
     drift = np.where(
-        rate * time_s > _SERIES_BELOW,
+        rate * time_s > SERIES_BELOW,
         (time_s + decay / rate) / rate,
         0.5 * time_s**2 * (1.0 - rate * time_s / 3.0 + (rate * time_s) ** 2 / 12.0),
     )

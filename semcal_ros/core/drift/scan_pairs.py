@@ -56,6 +56,31 @@ from semcal_ros.core.arrays import (
     invert_scaled,
 )
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.thresholds import (
+    BEND_PX,
+    COARSE_SIGMA_PX,
+    COMMON_SLOPE_MIN,
+    COMPARED_TILE_PX,
+    DISPLACED_LINES_MAX,
+    FAR_MEDIANS,
+    FREEDOM_MIN,
+    INTERPOLATED_PX,
+    KNOT_PX,
+    KNOTS_MAX,
+    LINE_STEPS,
+    PERIODIC_PEAK_MIN,
+    ROUNDS_FREE,
+    ROUNDS_MAX,
+    SAME_PLACE_PX,
+    SEARCHED_TILE_PX,
+    SETTLED_SIGMAS,
+    SPARSE_PX,
+    STILL_PX,
+    TILE_RIM_PX,
+    TILE_VARIANCE_MIN,
+    TILES_SMOOTHED_PX,
+    ZERO_SIGMA_PX,
+)
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.rectification.stack import Stack, StackedImage, find_scanned
@@ -68,46 +93,8 @@ from semcal_ros.core.registration.register import register_pair
 from semcal_ros.core.registration.tiles import Pyramid
 from semcal_ros.core.wording import counted
 
-# Sides of tiles, px: of those that are searched, which need enough structure for a peak, and of those that are
-# compared pixel by pixel, which are the smaller the less the drift changes within.
-_SEARCHED_PX, _COMPARED_PX = 64, 32
 # Three rows of tiles; with fewer, there is no function of the slow axis.
-_LEAST_SIDE_PX = 3 * _SEARCHED_PX
-# Lines from knot to knot, which a row of the smaller tiles tells with ease; and what a minute of solving allows.
-_KNOT_PX, _MAX_KNOTS = 48, 32
-# Smoothing before gradients are taken, and pixels at the edge of a tile that it spoils.
-_SMOOTH_PX, _RIM_PX = 1.0, 3
-# Gradients that two tiles must have in common, of all that they have: noise alone has 0.1 by chance in a tile of
-# 26 x 26 px after that smoothing. In one direction alone, a quarter of it.
-_COMMON_SLOPE = 0.3
-# Least mean square of the difference of two tiles of variance 1: that of the rounding to 8 bits.
-_LEAST_VARIANCE = 1e-6
-# The displacement is taken out and what is left is measured again until it stays where it is.
-_MAX_ROUNDS, _FREE_ROUNDS = 12, 2
-_STILL_PX = 0.003
-# Where little is known, it may wander within what is known of it.
-_SETTLED_SIGMAS = 0.5
-# Displacement from line to line beyond which scans are not compared: a twentieth of the width in a fifth of a scan.
-_FASTEST = 0.25
-# Steps of the fixed point by which the line of a displaced pixel is found; each gains the slope of the displacement,
-# which is well below a tenth.
-_LINE_STEPS = 4
-# Pixels between those of a tile over which its place on the slow axis is averaged.
-_SPARSE = 8
-# 1-sigma of a shift that is only searched for, px; how many times the median tiles may be off; and heights of peaks
-# that may be periods of a lattice, of the highest.
-_COARSE_PX, _FAR, _PERIODIC = 1.0, 4.0, 0.8
-# How much the drift is taken to bend at a knot, px: far more than tiles tell it to, so that it decides only where no
-# tile was measured, and the drift goes on there in a straight line with such an uncertainty.
-_BEND_PX = 2.0
-# Part of a tile's residual that the fit leaves it at least: what a knot is told by one tile alone has no residual.
-_LEAST_FREEDOM = 0.02
-# Of the mean over the first scan, which is zero by definition, px.
-_ZERO_PX = 1e-4
-# Corrected scans whose whole images are farther apart are not, px.
-_SAME_PLACE_PX = 0.5
-# Pixels that a cubic interpolation takes beyond the two nearest ones.
-_REACH_PX = 1
+_LEAST_SIDE_PX = 3 * SEARCHED_TILE_PX
 _OTHER_SENSE = "try the other sense of rotation, -90 instead of 90 or the reverse"
 _WHY_NOT = (
     "look whether both scans show one place, are turned by 90 degrees in the sense that is said,"
@@ -216,7 +203,7 @@ def measure_scan_pairs(scans: Sequence[TurnedScan]) -> ScanPairDrift:
         )
     # Of a tall frame, the square shows only the middle lines.
     lines = np.concatenate([raster.map_y.ravel() for raster in rasters]) / scans[0].image.shape[0]
-    count = min(side // _KNOT_PX, _MAX_KNOTS)
+    count = min(side // KNOT_PX, KNOTS_MAX)
     knots = lines.min() + (np.arange(count) + 0.5) / count * np.ptp(lines)
     drift = np.zeros((len(scans), count, 2))
 
@@ -230,19 +217,19 @@ def measure_scan_pairs(scans: Sequence[TurnedScan]) -> ScanPairDrift:
         drift[number] = _measure_offset(warped[0], warped[number], number)
     drift = _search(warp(), pairs, knots, drift)
     allowed: set[_Place] | None = None
-    for number in range(_MAX_ROUNDS):
+    for number in range(ROUNDS_MAX):
         found, compared = _refine(warp(), pairs, knots, drift, allowed)
         # A tile at the edge that came and went with each step would keep it from settling.
-        if number >= _FREE_ROUNDS:
+        if number >= ROUNDS_FREE:
             allowed = compared
         change = float(np.abs(found.displacement_px - drift).max())
         drift = found.displacement_px
         _check_speed(found, side)
-        if change < _STILL_PX:
+        if change < STILL_PX:
             break
-    if change > _SETTLED_SIGMAS * float(found.sigma_px.max()) + _STILL_PX:
+    if change > SETTLED_SIGMAS * float(found.sigma_px.max()) + STILL_PX:
         raise InvalidValueError(
-            f"displacements that still change by {change:.2g} px after {_MAX_ROUNDS} rounds",
+            f"displacements that still change by {change:.2g} px after {ROUNDS_MAX} rounds",
             expected="scans with enough structure in all parts",
             do=_WHY_NOT,
         )
@@ -253,13 +240,13 @@ def measure_scan_pairs(scans: Sequence[TurnedScan]) -> ScanPairDrift:
 def _check_speed(drift: ScanPairDrift, side: int) -> None:
     """Refuse a drift that no specimen has, and for which the lines would not be found."""
     lines = np.diff(drift.progress) * side / np.ptp(drift.progress)
-    known = drift.sigma_px.max(axis=2) < _BEND_PX
+    known = drift.sigma_px.max(axis=2) < BEND_PX
     speeds = np.abs(np.diff(drift.displacement_px, axis=1)).max(axis=2) / lines
     fastest = float(np.max(speeds, where=known[:, 1:] & known[:, :-1], initial=0.0))
-    if fastest > _FASTEST:
+    if fastest > DISPLACED_LINES_MAX:
         raise InvalidValueError(
             f"a drift by {fastest:.2g} px from line to line",
-            expected=f"at most {_FASTEST:g} px",
+            expected=f"at most {DISPLACED_LINES_MAX:g} px",
             do=_WHY_NOT,
         )
 
@@ -358,7 +345,7 @@ def _shrink(usable: Mask) -> Mask:
     """Pixels whose neighbours, which an interpolation takes, may be used, too."""
     if usable.all():
         return usable
-    side = 2 * (_REACH_PX + 1) + 1
+    side = 2 * (INTERPOLATED_PX + 1) + 1
     return np.asarray(minimum_filter(usable, size=side, mode="nearest"))
 
 
@@ -381,14 +368,14 @@ def _warp(raster: _Raster, knots: Array, displacement_px: Array) -> _Warped:
     rows, cols = np.indices((side, side), dtype=np.float32)
     x, y = raster.map_x, raster.map_y
     spline = CubicSpline(knots, displacement_px)
-    for _ in range(_LINE_STEPS if displacement_px.any() or any(raster.offset) else 0):
+    for _ in range(LINE_STEPS if displacement_px.any() or any(raster.offset) else 0):
         moved = (spline(_progress(x, y, raster)) + raster.offset).astype(np.float32)
         at_x, at_y = cols + moved[..., 0], rows + moved[..., 1]
         x = _sample_map(raster.map_x, raster.slopes_x, at_x, at_y)
         y = _sample_map(raster.map_y, raster.slopes_y, at_x, at_y)
     # OpenCV rounds positions to 1/32 px, which is more than the displacements are known to.
     image = map_coordinates(raster.coefficients, [y, x], order=3, mode="nearest", prefilter=False)
-    valid = find_scanned(x, y, (width, height), _REACH_PX)
+    valid = find_scanned(x, y, (width, height), INTERPOLATED_PX)
     if not raster.usable.all():
         nearest = (
             np.clip(np.rint(at), 0, top - 1).astype(np.intp)
@@ -501,7 +488,7 @@ def _look_at_tiles(
         told = look(both[0].image[part], both[1].image[part])
         if told is None:
             continue
-        sparse = tuple(slice(one.start + _SPARSE // 2, one.stop, _SPARSE) for one in part)
+        sparse = tuple(slice(one.start + SPARSE_PX // 2, one.stop, SPARSE_PX) for one in part)
         means = [weigh(one.progress[sparse]).mean(axis=(0, 1)) for one in both]
         found.append((*told, (i, j), means, (top, left)))
     if not found:
@@ -524,9 +511,9 @@ def _search_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None:
     if not near:
         return None
     # On a lattice all periods are about as high.
-    high = [peak for peak in near if peak.correlation > _PERIODIC * near[0].correlation]
+    high = [peak for peak in near if peak.correlation > PERIODIC_PEAK_MIN * near[0].correlation]
     best = min(high, key=lambda peak: math.hypot(*peak.shift_px))
-    information = np.eye(2) / _COARSE_PX**2
+    information = np.eye(2) / COARSE_SIGMA_PX**2
     return information, information @ np.array(best.shift_px)
 
 
@@ -536,10 +523,10 @@ def _compare_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None
     The matrix is of products of the gradients of one image with those of the other, to which noise adds nothing on
     average; the right side, with the mean of both gradients, is zero on average where the images agree.
     """
-    inner = slice(_RIM_PX, -_RIM_PX), slice(_RIM_PX, -_RIM_PX)
+    inner = slice(TILE_RIM_PX, -TILE_RIM_PX), slice(TILE_RIM_PX, -TILE_RIM_PX)
     greys, slopes = [], []
     for image in (first, second):
-        smooth = cv2.GaussianBlur(image, (0, 0), _SMOOTH_PX)
+        smooth = cv2.GaussianBlur(image, (0, 0), TILES_SMOOTHED_PX)
         grey = (smooth[inner] - smooth[inner].mean()).ravel()
         spread = float(np.sqrt(np.mean(grey**2)))
         if spread == 0.0:
@@ -552,14 +539,14 @@ def _compare_tile(first: Array32, second: Array32) -> tuple[Array, Array] | None
     slopes = [one - one.mean(axis=1, keepdims=True) for one in slopes]
     slopes = [one - np.outer(one @ common, common) for one in slopes]
     left = greys[0] - greys[1]
-    variance = max(float(np.mean(left**2)), _LEAST_VARIANCE)
+    variance = max(float(np.mean(left**2)), TILE_VARIANCE_MIN)
     cross = slopes[0] @ slopes[1].T
     own = math.sqrt(float(np.sum(slopes[0] ** 2)) * float(np.sum(slopes[1] ** 2)))
-    if not float(np.trace(cross)) > _COMMON_SLOPE * own:
+    if not float(np.trace(cross)) > COMMON_SLOPE_MIN * own:
         return None
     # Along an edge, or by chance across it, nothing is known of the shift; that is never less than nothing.
     values, vectors = np.linalg.eigh(0.5 * (cross + cross.T))
-    known = vectors * (values > _COMMON_SLOPE * own / 4.0)
+    known = vectors * (values > COMMON_SLOPE_MIN * own / 4.0)
     information = (known * values) @ known.T
     # Of a shift by d, the second image is the first one less its slope times d.
     right = known @ known.T @ (0.5 * (slopes[0] + slopes[1]) @ left)
@@ -592,14 +579,14 @@ def _search(
     warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]], knots: Array, drift: Array
 ) -> Array:
     """The drift (n, k, 2) to a fraction of a pixel, from tiles that are searched one by one."""
-    tiles, _ = _look_at_tiles(warped, pairs, _SEARCHED_PX, knots, _search_tile)
+    tiles, _ = _look_at_tiles(warped, pairs, SEARCHED_TILE_PX, knots, _search_tile)
     scans, count = drift.shape[:2]
     prior = _prior_information(scans, count)
     while True:
         found, _, left = _solve(tiles, tiles.design(scans), prior, drift)
         # Of the searched tiles, what is left in units of their sigma.
-        far = np.hypot(*left.T) * _COARSE_PX
-        near = far <= max(_FAR * float(np.median(far)), _COARSE_PX)
+        far = np.hypot(*left.T) * COARSE_SIGMA_PX
+        near = far <= max(FAR_MEDIANS * float(np.median(far)), COARSE_SIGMA_PX)
         if near.all():
             return found.reshape(drift.shape)
         tiles = _Tiles(*(getattr(tiles, name.name)[near] for name in fields(tiles)))
@@ -613,7 +600,7 @@ def _refine(
     allowed: set[_Place] | None,
 ) -> tuple[ScanPairDrift, set[_Place]]:
     """One step of Gauss and Newton for the drift, and the tiles that it rests on."""
-    tiles, used = _look_at_tiles(warped, pairs, _COMPARED_PX, knots, _compare_tile, allowed)
+    tiles, used = _look_at_tiles(warped, pairs, COMPARED_TILE_PX, knots, _compare_tile, allowed)
     scans, count = drift.shape[:2]
     unknowns = scans * count
     design, prior = tiles.design(scans), _prior_information(scans, count)
@@ -621,7 +608,7 @@ def _refine(
     freedom = len(left) - unknowns
     if freedom < unknowns:
         raise InvalidValueError(
-            f"{counted(len(left), 'tile')} of {_COMPARED_PX} px that both scans show",
+            f"{counted(len(left), 'tile')} of {COMPARED_TILE_PX} px that both scans show",
             expected=f"at least {2 * unknowns} for {counted(unknowns, 'displacement')}",
             do="take pictures that overlap by more",
         )
@@ -632,7 +619,7 @@ def _refine(
     # doi:10.1093/biomet/73.1.13).
     fitted = np.einsum("tu,uavb,tv->tab", design, inverse, design, optimize=True)
     free = np.eye(2) - tiles.information @ fitted
-    undone = np.linalg.solve(free + _LEAST_FREEDOM * np.eye(2), left[..., None])[..., 0]
+    undone = np.linalg.solve(free + FREEDOM_MIN * np.eye(2), left[..., None])[..., 0]
     scores = np.einsum("tu,ta->tua", design, undone).reshape(len(left), -1)
     places = np.zeros((tiles.place.max() + 1, scores.shape[1]))
     np.add.at(places, tiles.place, scores)
@@ -650,10 +637,10 @@ def _refine(
 def _prior_information(scans: int, count: int) -> Array:
     """(n k, 2, n k, 2) information on bends at the knots, and on the mean over the first scan."""
     unknowns = scans * count
-    bends = np.diff(np.eye(count), n=2, axis=0) / _BEND_PX
+    bends = np.diff(np.eye(count), n=2, axis=0) / BEND_PX
     one = np.kron(np.eye(scans), bends.T @ bends)
     mean = np.zeros(unknowns)
-    mean[:count] = 1.0 / count / _ZERO_PX
+    mean[:count] = 1.0 / count / ZERO_SIGMA_PX
     one += np.outer(mean, mean)
     return np.einsum("uv,ab->uavb", one, np.eye(2))
 
@@ -669,7 +656,7 @@ def _check(warped: Sequence[_Warped], pairs: Sequence[tuple[int, int]]) -> None:
         )
         # It need not be accepted: what little is left between lines is no shift of the whole, and may not converge.
         same = found.correlation >= RegistrationSettings().min_correlation
-        if not (same and math.hypot(*found.shift_px) < _SAME_PLACE_PX):
+        if not (same and math.hypot(*found.shift_px) < SAME_PLACE_PX):
             raise InvalidValueError(
                 f"scans {i + 1} and {j + 1} do not match, corrected as well as they can be: {found.reason}",
                 expected="scans of one place that are turned by what is said",

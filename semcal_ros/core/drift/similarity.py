@@ -30,14 +30,13 @@ alone at a level that chance reaches once in a million frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.gating import GATE
 from semcal_ros.core.drift.measurement import keyframe_noise
 from semcal_ros.core.drift.operations import (
     CloneKeyframe,
@@ -49,30 +48,26 @@ from semcal_ros.core.drift.operations import (
     Transition,
 )
 from semcal_ros.core.drift.process_noise import ProcessNoise
-from semcal_ros.core.drift.smoother import Mark, estimate_process_noise, smooth
+from semcal_ros.core.drift.shared_sequence import SharedSequence
+from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import KEYFRAME_SIZE, MOTION_SIZE, DriftState, initial_state
+from semcal_ros.core.drift.thresholds import (
+    INNOVATION_CHI2_MAX,
+    INTERVAL_S_MIN,
+    RAW_DISTORTION,
+    RAW_OFF_CENTRE,
+    SCREEN_SIGMAS,
+    TURN_FLOOR_PX,
+    TURN_OF_SHIFT,
+    UNMEASURED_TURN,
+    UNPREDICTED_MAX,
+)
 from semcal_ros.core.rectification.raw_positions import rotation_centre, similarity_matrix
 from semcal_ros.core.registration.inverse_compositional import Alignment, SimilarityFit
 from semcal_ros.core.registration.register import Registration
 
-# Sigmas by which the left and the right half must differ before more than the shift is fitted: a
-# screen that costs nothing, and lets one frame in a hundred through by chance.
-_SCREEN_SIGMAS = 2.5
-# Largest unpredicted rotation (rad) and change of scale: beyond, a registration by shift alone fails.
-_MAX_UNPREDICTED = 0.01
-# As for the shear of a frame (measurement.py): what one linear step leaves, px over the image, and what any
-# distortion leaves, as a part of the shift.
-_FLOOR_PX, _OF_SHIFT = 0.02, 1e-3
-# Radial distortion and distance of its centre from the middle, in half widths, where there is no camera:
-# the 1-sigma of an uncalibrated one (ScanCamera.nominal).
-_RAW_DISTORTION, _RAW_OFF_CENTRE = 5e-3, 0.1
 # Places of the parameters in ScanCamera.covariance.
 _DISTORTIONS, _DISTORTION_CENTRE = slice(6, 8), slice(8, 10)
-# Rotation (rad) or scale between a frame and a keyframe of which nothing was measured: what fits
-# into the half of a pixel over 100 px that registration tolerates.
-_UNMEASURED = 5e-3
-# Divisions by intervals stay finite.
-_MIN_INTERVAL_S = 1e-9
 
 
 @dataclass(frozen=True)
@@ -148,7 +143,7 @@ class PlaceKeyframe(Operation):
 
 
 @dataclass(frozen=True)
-class _QuietKeyframe:
+class QuietKeyframe:
     """Rotation and scale of a keyframe while none was found: a sum of insignificant measurements."""
 
     mean: Array
@@ -168,103 +163,119 @@ class SimilarityPredictor:
         return _estimate(Predict(time_s)(self.state, self.process_noise))
 
 
-class SimilarityTracker:
-    """Looks for rotation and scale in a stream, and follows them once they are found.
+@dataclass(frozen=True)
+class SimilarityState:
+    """What a stream has shown of rotation and scale: looked for, and followed once they are found. What happens to it
+    makes another one.
 
-    Parameters
+    Attributes
     ----------
     keeps_history
         Whether to keep what a smoother needs.
+    filter
+        The filter that follows them; None until any were found.
+    quiet
+        The keyframes before, by number.
+    times
+        Times of the frames before, where the history is kept.
+    suspected
+        Time of the latest frame that showed any, and what it showed (2,).
+    before_marks
+        Number of frames before the keyframe at which the filter starts.
+    was_outlier
+        Whether the latest measurement was too far from its prediction.
     """
 
-    def __init__(self, *, keeps_history: bool) -> None:
-        self._keeps_history = keeps_history
-        self._filter: DriftFilter | None = None
-        self._quiet: dict[int, _QuietKeyframe] = {}
-        self._times: list[float] = []
-        self._suspected: tuple[float, Array] | None = None
-        self._before_marks = 0
-        self._was_outlier = False
+    keeps_history: bool
+    filter: DriftFilter | None = None
+    quiet: dict[int, QuietKeyframe] = field(default_factory=dict)
+    times: SharedSequence[float] = field(default_factory=SharedSequence)
+    suspected: tuple[float, Array] | None = None
+    before_marks: int = 0
+    was_outlier: bool = False
 
     @property
     def is_active(self) -> bool:
         """Whether rotation or scale was found."""
-        return self._filter is not None
+        return self.filter is not None
 
     # -- time and keyframes -----------------------------------------------------------------------
 
-    def predict(self, time_s: float) -> None:
+    def predict(self, time_s: float) -> SimilarityState:
         """Predict until a time."""
-        if self._filter is not None:
-            self._filter.apply(Predict(time_s))
+        return self if self.filter is None else self._apply(self.filter, Predict(time_s))
 
-    def mark_frame(self, time_s: float) -> None:
+    def mark_frame(self, time_s: float) -> SimilarityState:
         """Note that the present state is that of a frame."""
-        if self._filter is not None:
-            self._filter.mark_frame()
-        elif self._keeps_history:
-            self._times.append(time_s)
+        if self.filter is not None:
+            return replace(self, filter=self.filter.mark_frame())
+        return replace(self, times=self.times.with_item(time_s)) if self.keeps_history else self
 
-    def add_keyframe(self, key: int, removed: Array, time_s: float) -> None:
+    def add_keyframe(self, key: int, removed: Array, time_s: float) -> SimilarityState:
         """Note a keyframe that was not measured, from a frame without ``removed`` (2,)."""
-        if self._filter is not None:
-            self._filter.apply(PlaceKeyframe(key, -removed, np.zeros((2, 2)), follows=True))
-            return
-        latest = next(reversed(self._quiet.values()), None)
+        if self.filter is not None:
+            place = PlaceKeyframe(key, -removed, np.zeros((2, 2)), follows=True)
+            return self._apply(self.filter, place)
+        latest = next(reversed(self.quiet.values()), None)
         covariance = np.zeros((2, 2)) if latest is None else latest.covariance
-        self._quiet[key] = _QuietKeyframe(np.zeros(2), covariance, time_s)
+        return self._with_quiet(key, QuietKeyframe(np.zeros(2), covariance, time_s))
 
     def clone_keyframe(
         self, key: int, parent: int, registration: Registration, removed: Array, time_s: float
-    ) -> None:
+    ) -> SimilarityState:
         """Note a frame that became a keyframe as it was measured against ``parent``."""
         fit = registration.fit_similarity()
-        if self._filter is not None:
+        if self.filter is not None:
             if fit is None or not np.all(np.isfinite(fit.covariance)):
-                self.add_keyframe(key, removed, time_s)
-                return
+                return self.add_keyframe(key, removed, time_s)
             shift = np.append(fit.values[4:], np.zeros(2))
-            self._filter.apply(CloneKeyframe(key, parent, shift, 1.0, np.zeros((4, 4))))
-            return
-        mean, covariance = self._quiet[parent].mean, self._quiet[parent].covariance
+            clone = CloneKeyframe(key, parent, shift, 1.0, np.zeros((4, 4)))
+            return self._apply(self.filter, clone)
+        mean, covariance = self.quiet[parent].mean, self.quiet[parent].covariance
         if fit is None:
-            covariance = covariance + np.eye(2) * _UNMEASURED**2
+            covariance = covariance + np.eye(2) * UNMEASURED_TURN**2
         else:
             mean, covariance = mean + fit.values[4:], covariance + fit.covariance[4:, 4:]
-        self._quiet[key] = _QuietKeyframe(mean, covariance, time_s)
+        return self._with_quiet(key, QuietKeyframe(mean, covariance, time_s))
 
-    def forget(self, key: int) -> None:
+    def forget(self, key: int) -> SimilarityState:
         """Forget a keyframe."""
-        self._quiet.pop(key, None)
-        if self._filter is not None:
-            self._filter.apply(Marginalise(key))
+        rest = {k: quiet for k, quiet in self.quiet.items() if k != key}
+        known = replace(self, quiet=rest)
+        return known if known.filter is None else known._apply(known.filter, Marginalise(key))
+
+    def _apply(self, drift_filter: DriftFilter, operation: Operation) -> SimilarityState:
+        return replace(self, filter=drift_filter.apply(operation))
+
+    def _with_quiet(self, key: int, quiet: QuietKeyframe) -> SimilarityState:
+        return replace(self, quiet={**self.quiet, key: quiet})
 
     def keyframe_similarity(self, key: int) -> Array:
         """(2,) rotation and scale with which a keyframe appears."""
-        if self._filter is None:
+        if self.filter is None:
             return np.zeros(2)
-        return self._filter.state.keyframe_state(key)[:2].copy()
+        return self.filter.state.keyframe_state(key)[:2].copy()
 
     def expected_turn(self, key: int) -> Array:
         """(2,) rotation and scale of the present frame against a keyframe, as they are predicted."""
-        if self._filter is None:
+        if self.filter is None:
             return np.zeros(2)
-        return self._filter.state.position - self.keyframe_similarity(key)
+        return self.filter.state.position - self.keyframe_similarity(key)
 
     @property
     def keys(self) -> tuple[int, ...]:
         """Numbers of the keyframes, once rotation or scale was found."""
-        return () if self._filter is None else self._filter.state.keys
+        return () if self.filter is None else self.filter.state.keys
 
     @property
     def position(self) -> Array:
         """(2,) rotation and scale at the present time."""
-        return np.zeros(2) if self._filter is None else self._filter.state.position.copy()
+        return np.zeros(2) if self.filter is None else self.filter.state.position.copy()
 
     @property
     def rate(self) -> Array:
         """(2,) rates of rotation and scale, per s."""
-        return np.zeros(2) if self._filter is None else self._filter.state.velocity.copy()
+        return np.zeros(2) if self.filter is None else self.filter.state.velocity.copy()
 
     # -- measurements -----------------------------------------------------------------------------
 
@@ -279,11 +290,12 @@ class SimilarityTracker:
             return None
         turn = removed + fit.values[4:]
         covariance = fit.covariance[4:, 4:]
-        if self._filter is None:
+        if self.filter is None:
             covariance = covariance + _floor(registration, frame)
         unpredicted = np.abs(turn - self.expected_turn(key))
         if not (
-            _mahalanobis(fit.values[4:], covariance) > GATE and max(unpredicted) < _MAX_UNPREDICTED
+            _mahalanobis(fit.values[4:], covariance) > INNOVATION_CHI2_MAX
+            and max(unpredicted) < UNPREDICTED_MAX
         ):
             return None
         return np.asarray(turn)
@@ -297,7 +309,7 @@ class SimilarityTracker:
         averaged: float,
         *,
         measures: bool,
-    ) -> SimilarityMatch:
+    ) -> tuple[SimilarityState, SimilarityMatch]:
         """Compare a registration with what is expected.
 
         Parameters
@@ -312,23 +324,28 @@ class SimilarityTracker:
             Number of frames in the mean of the keyframe.
         measures
             Whether rotation and scale are measured: not across a change of magnification.
+
+        Returns
+        -------
+        What is known now, since the noise of a keyframe is known when something is compared with it, and the match,
+        which :meth:`use` makes use of.
         """
-        drift_filter = self._filter
+        known, drift_filter = self, self.filter
         if drift_filter is None:
-            return SimilarityMatch(None, removed, (), removed, np.zeros((2, 2)))
+            return self, SimilarityMatch(None, removed, (), removed, np.zeros((2, 2)))
         fit = registration.fit_similarity()
         state, nis = drift_filter.state, float("nan")
         operations: tuple[Inflate | Measure, ...] = ()
         if fit is not None and measures:
             measure = _make_measure(key, fit, removed, averaged, _floor(registration, frame))
             if drift_filter.pending == key:
-                drift_filter.set_keyframe_noise(keyframe_noise(measure), 0.0)
-                state = drift_filter.state
+                drift_filter = drift_filter.set_keyframe_noise(keyframe_noise(measure), 0.0)
+                known, state = replace(self, filter=drift_filter), drift_filter.state
             outcome = measure(state, drift_filter.process_noise)
             nis = outcome.nis
-            if nis <= GATE:
+            if nis <= INNOVATION_CHI2_MAX:
                 state, operations = outcome.state, (measure,)
-            elif self._was_outlier:
+            elif self.was_outlier:
                 # Twice in a row: it turns otherwise than expected.
                 innovation = np.outer(outcome.innovation, outcome.innovation)
                 spread = np.zeros((MOTION_SIZE, MOTION_SIZE))
@@ -338,20 +355,20 @@ class SimilarityTracker:
                 state = measure(inflated, drift_filter.process_noise).state
                 operations = (inflate, measure)
         turn, covariance = state.predict_shift(key)
-        return SimilarityMatch(fit, removed, operations, turn, covariance, nis)
+        return known, SimilarityMatch(fit, removed, operations, turn, covariance, nis)
 
-    def use(self, match: SimilarityMatch, since_s: float) -> None:
+    def use(self, match: SimilarityMatch, since_s: float) -> SimilarityState:
         """Update the filter by a match."""
-        if self._filter is None or match.fit is None:
-            return
-        self._was_outlier = bool(match.nis > GATE)
+        updated = self.filter
+        if updated is None or match.fit is None:
+            return self
         for operation in match.operations:
             if isinstance(operation, Measure):
-                self._filter.update(operation)
                 noise = operation.covariance[:2, :2]
-                self._filter.adapt_process_noise(match.nis, noise, since_s)
+                updated = updated.update(operation).adapt_process_noise(match.nis, noise, since_s)
             else:
-                self._filter.apply(operation)
+                updated = updated.apply(operation)
+        return replace(self, filter=updated, was_outlier=bool(match.nis > INNOVATION_CHI2_MAX))
 
     # -- evidence ---------------------------------------------------------------------------------
 
@@ -362,60 +379,56 @@ class SimilarityTracker:
         frame: ScanFrame,
         time_s: float,
         last_s: float,
-    ) -> Array | None:
+    ) -> tuple[SimilarityState, Array | None]:
         """(2,) rotation and scale that an accepted registration at ``time_s`` and the one before it, at
-        ``last_s``, show in the same sense; None where they do not, or where they are followed already.
+        ``last_s``, show in the same sense; None where they do not, or where they are followed already. With what is
+        known now.
         """
-        if self._filter is not None or not _stands_out(registration.alignment):
-            return None
+        if self.filter is not None or not _stands_out(registration.alignment):
+            return self, None
         fit = registration.fit_similarity()
         if fit is None:
-            return None
+            return self, None
         values = fit.values[4:]
         covariance = fit.covariance[4:, 4:] + _floor(registration, frame)
-        if _mahalanobis(values, covariance) <= GATE:
-            return None
-        before, self._suspected = self._suspected, (time_s, values)
+        if _mahalanobis(values, covariance) <= INNOVATION_CHI2_MAX:
+            return self, None
+        before, known = self.suspected, replace(self, suspected=(time_s, values))
         if before is None or before[0] != last_s:
-            return None
+            return known, None
         # The inner product in units of their noise.
         is_same = float(before[1] @ solve_scaled(covariance, values)) > 0.0
-        return np.asarray(removed + values) if is_same else None
+        return known, np.asarray(removed + values) if is_same else None
 
-    def activate(self, key: int, turn: Array, time_s: float) -> None:
+    def activate(self, key: int, turn: Array, time_s: float) -> SimilarityState:
         """Begin to follow rotation and scale, of which a frame at ``time_s`` shows about ``turn`` (2,)
         against keyframe ``key``.
 
         They begin at that keyframe; what the keyframes before it have summed up is its sigma.
         """
-        start = self._quiet[key]
+        start = self.quiet[key]
         state = initial_state(start.time_s)
         covariance = state.covariance.copy()
         covariance[:2, :2] = start.covariance
         mean = np.append(start.mean, np.zeros(state.mean.size - 2))
-        drift_filter = DriftFilter(
-            replace(state, mean=mean, covariance=covariance), None, history=self._keeps_history
-        )
-        drift_filter.add_keyframe(key, np.zeros(4), 0.0)
-        times = [t for t in self._times if t >= start.time_s]
-        self._before_marks = len(self._times) - len(times)
-        interval_s = max(time_s - (times[-1] if times else start.time_s), _MIN_INTERVAL_S)
+        drift_filter = DriftFilter.begin(
+            replace(state, mean=mean, covariance=covariance), None, keeps_history=self.keeps_history
+        ).add_keyframe(key, np.zeros(4), 0.0)
+        times = [t for t in self.times if t >= start.time_s]
+        interval_s = max(time_s - (times[-1] if times else start.time_s), INTERVAL_S_MIN)
         # All of it may have come in the last interval.
         step = float(np.hypot(*turn))
-        drift_filter.set_motion_prior(step / interval_s, step**2 / interval_s**3, interval_s)
-        for other, quiet in self._quiet.items():
+        drift_filter = drift_filter.set_motion_prior(
+            step / interval_s, step**2 / interval_s**3, interval_s
+        )
+        for other, quiet in self.quiet.items():
             if other != key:
                 place = PlaceKeyframe(other, quiet.mean, quiet.covariance, follows=False)
-                drift_filter.apply(place)
+                drift_filter = drift_filter.apply(place)
         for t in times:
-            drift_filter.apply(Predict(t))
-            drift_filter.mark_frame()
-        drift_filter.apply(Predict(time_s))
-        self._filter = drift_filter
-
-    def deactivate(self) -> None:
-        """Undo :meth:`activate`."""
-        self._filter = None
+            drift_filter = drift_filter.apply(Predict(t)).mark_frame()
+        drift_filter = drift_filter.apply(Predict(time_s))
+        return replace(self, filter=drift_filter, before_marks=len(self.times) - len(times))
 
     # -- results ----------------------------------------------------------------------------------
 
@@ -425,8 +438,8 @@ class SimilarityTracker:
         """Rotation and scale at the present frame; zero, with what its registration does not exclude as
         sigma, as long as none were found.
         """
-        if self._filter is not None:
-            return _estimate(self._filter.state)
+        if self.filter is not None:
+            return _estimate(self.filter.state)
         if is_first:
             return SimilarityEstimate(np.zeros(4), np.diag([0.0, 0.0, np.inf, np.inf]))
         variance = np.full(4, np.inf)
@@ -439,17 +452,15 @@ class SimilarityTracker:
 
     def predictor(self) -> SimilarityPredictor | None:
         """What a prediction needs; None where nothing was found."""
-        if self._filter is None:
+        if self.filter is None:
             return None
-        return SimilarityPredictor(
-            self._filter.state.without_keyframes(), self._filter.process_noise
-        )
+        return SimilarityPredictor(self.filter.state.without_keyframes(), self.filter.process_noise)
 
     def smooth(self) -> list[SimilarityEstimate | None]:
         """Rotation and scale of all frames, given all measurements; None where none were found."""
-        drift_filter = self._filter
+        drift_filter = self.filter
         if drift_filter is None:
-            return [None] * len(self._times)
+            return [None] * len(self.times)
         process_noise = estimate_process_noise(
             drift_filter.start, drift_filter.events, drift_filter.process_noise
         )
@@ -458,14 +469,7 @@ class SimilarityTracker:
         square = first.covariance[:2, :2] + np.outer(first.mean[:2], first.mean[:2])
         before = np.diag(np.append(np.diag(square), [np.inf, np.inf]))
         quiet = SimilarityEstimate(np.zeros(4), before)
-        return [*[quiet] * self._before_marks, *[_estimate(s) for s in states]]
-
-    @property
-    def marks(self) -> int:
-        """Number of frames that were marked."""
-        if self._filter is None:
-            return len(self._times)
-        return self._before_marks + sum(isinstance(e, Mark) for e in self._filter.events)
+        return [*[quiet] * self.before_marks, *[_estimate(s) for s in states]]
 
 
 def _estimate(state: DriftState) -> SimilarityEstimate:
@@ -488,16 +492,16 @@ def _floor(registration: Registration, frame: ScanFrame) -> Array:
     camera, width = frame.camera, float(frame.size[0])
     xi, off_centre, per_width = 0.0, 0.0, 2.0
     if camera is None:
-        xi, off_centre = _RAW_DISTORTION, _RAW_OFF_CENTRE
+        xi, off_centre = RAW_DISTORTION, RAW_OFF_CENTRE
     elif camera.covariance is not None:
         variances = np.diag(camera.covariance)
         xi = float(np.sqrt(np.max(variances[_DISTORTIONS])))
         per_width = width / camera.norm_px
         off_centre = float(np.sqrt(np.sum(variances[_DISTORTION_CENTRE]))) / camera.norm_px
     part = float(np.hypot(*registration.shift_px)) / width
-    linear = max(_OF_SHIFT, 6.0 * xi * off_centre * per_width) * part
+    linear = max(TURN_OF_SHIFT, 6.0 * xi * off_centre * per_width) * part
     curved = 3.0 * xi * (part * per_width) ** 2
-    return np.eye(2) * ((_FLOOR_PX / width) ** 2 + linear**2 + curved**2)
+    return np.eye(2) * ((TURN_FLOOR_PX / width) ** 2 + linear**2 + curved**2)
 
 
 def _half_lever_px(alignment: Alignment, frame: ScanFrame) -> float:
@@ -507,7 +511,7 @@ def _half_lever_px(alignment: Alignment, frame: ScanFrame) -> float:
 
 def _stands_out(alignment: Alignment) -> bool:
     square, variance = alignment.half_difference_px[0] ** 2, alignment.half_variance[0]
-    return bool(np.any(square > _SCREEN_SIGMAS**2 * variance))
+    return bool(np.any(square > SCREEN_SIGMAS**2 * variance))
 
 
 def _mahalanobis(vector: Array, covariance: Array) -> float:

@@ -37,24 +37,17 @@ from semcal_ros.core.arrays import Array, invert_scaled
 from semcal_ros.core.drift.operations import Measure, Operation
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import (
+    DENSITY_GRID,
+    DENSITY_LOG_RANGE,
+    DENSITY_LOG_TOLERANCE,
+    LIKELIHOOD_MEASUREMENTS_MAX,
+    LIKELIHOOD_MEASUREMENTS_MIN,
+    MEASUREMENT_COST_MAX,
+    MEASUREMENTS_UNCOUNTED,
+    SMOOTHER_BLOCK,
+)
 from semcal_ros.core.errors import InvalidValueError
-
-# A measurement costs no more than one at this normalised innovation squared (twice the outlier's 25
-# for shift and shear): a few outliers do not decide on the process noise.
-_MAX_COST = 50.0
-# The first two measurements are explained by the prior of the velocity.
-_UNCOUNTED = 2
-# Measurements for a likelihood: both components of 600 shifts tell a variance to 4 %.
-_MAX_FOR_LIKELIHOOD = 600
-# Fewest measurements from which process noise can be estimated.
-_MIN_FOR_LIKELIHOOD = 4
-# Logarithm of the density relative to the guess: a likelihood is flat beyond. A grid finds the
-# highest maximum, and Brent's method refines it; a tenth is far less than what the data can tell.
-_LOG_RANGE, _GRID = (-14.0, 5.0), 9
-_LOG_TOLERANCE = 0.1
-# Events between two states to which the backward pass returns. A step takes up to 320 kB (48 keyframes, of four
-# numbers each), so that a block stays below 170 MB, and so do the states between the blocks of 20 000 frames.
-_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -100,7 +93,7 @@ def _run_forward(
             inverse = invert_scaled(outcome.innovation_covariance)
             step = _Update(outcome.jacobian, outcome.innovation, inverse, remaining)
             size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
-            cost = min(outcome.nis + outcome.shear_nis, _MAX_COST) + size
+            cost = min(outcome.nis + outcome.shear_nis, MEASUREMENT_COST_MAX) + size
         else:
             step = state
         yield step, state, cost
@@ -141,8 +134,8 @@ def smooth(
     """
     blocks: list[tuple[DriftState, Sequence[Event]]] = []
     last = start
-    for first in range(0, len(events), _BLOCK):
-        blocks.append((last, events[first : first + _BLOCK]))
+    for first in range(0, len(events), SMOOTHER_BLOCK):
+        blocks.append((last, events[first : first + SMOOTHER_BLOCK]))
         last = replay(*blocks[-1], process_noise)
     smoothed: list[DriftState] = []
     # Adjoint of the state and its information: what later measurements say of it.
@@ -193,8 +186,8 @@ def estimate_process_noise(
     """
     if not near.psd > 0.0:
         raise InvalidValueError(f"{near}", expected="a positive density")
-    part = list(events)[: 4 * _MAX_FOR_LIKELIHOOD]
-    if sum(isinstance(event, Measure) for event in part) < _MIN_FOR_LIKELIHOOD:
+    part = list(events)[: 4 * LIKELIHOOD_MEASUREMENTS_MAX]
+    if sum(isinstance(event, Measure) for event in part) < LIKELIHOOD_MEASUREMENTS_MIN:
         return near
     candidates = [
         _maximise_likelihood(start, part, near, factor * near.time_constant_s)
@@ -219,12 +212,12 @@ def _maximise_likelihood(
             for event, (_, _, cost) in zip(events, steps, strict=True)
             if isinstance(event, Measure)
         ]
-        return sum(costs[_UNCOUNTED:], start=0.0)
+        return sum(costs[MEASUREMENTS_UNCOUNTED:], start=0.0)
 
-    grid = np.linspace(*_LOG_RANGE, _GRID)
+    grid = np.linspace(*DENSITY_LOG_RANGE, DENSITY_GRID)
     best = int(np.argmin([cost(float(v)) for v in grid]))
-    bounds = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, _GRID - 1)])
+    bounds = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, DENSITY_GRID - 1)])
     found = minimize_scalar(
-        cost, bounds=bounds, method="bounded", options={"xatol": _LOG_TOLERANCE}
+        cost, bounds=bounds, method="bounded", options={"xatol": DENSITY_LOG_TOLERANCE}
     )
     return float(found.fun), with_density(float(found.x))

@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.arrays import Mask
 from semcal_ros.core.drift.fixed_parts import (
-    LEAST_MOVE_PX,
     find_fixed_parts,
     share_of_gradients,
+)
+from semcal_ros.core.drift.thresholds import (
+    FIXED_MOVE_PX_MIN,
 )
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.drift_scenes import Texture
@@ -90,7 +92,7 @@ def test_a_spot_that_has_gone_is_specimen_again() -> None:
 
 def test_where_nothing_can_be_told_nothing_is_said() -> None:
     first, second = picture((0.0, 0.0), 0), picture((0.0, 4.0), 1)
-    assert find_fixed_parts(first, second, np.array([0.0, 0.9 * LEAST_MOVE_PX])) is None
+    assert find_fixed_parts(first, second, np.array([0.0, 0.9 * FIXED_MOVE_PX_MIN])) is None
     assert find_fixed_parts(first, second[:-1], np.array([0.0, 4.0])) is None
     assert find_fixed_parts(first, second, np.array([0.0, 0.6 * SIZE])) is None
     # A specimen that has not moved, and a drift that says so: all of it would stay.
@@ -120,10 +122,10 @@ def test_contrast_of_a_mean_does_not_grow() -> None:
     tracker = DriftTracker()
     merged = sum(tracker.update(frame, float(k)).merged for k, frame in enumerate(frames))
     assert merged > 20
-    track = tracker._track
-    assert track is not None
-    assert track.store.current is not None
-    mean = track.store[track.store.current].mean
+    assert tracker.state is not None
+    keyframes = tracker.state.keyframes
+    assert keyframes.current is not None
+    mean = keyframes[keyframes.current].mean
     # Particles are the brightest per cent; those of all frames brought to the first one are the truth.
     rows, cols = np.mgrid[60:324, 60:324]
     brought = np.mean(

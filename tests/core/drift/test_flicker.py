@@ -143,7 +143,7 @@ def estimate(
     for profile in path.reshape(frames, rows, tile, 2).mean(axis=2):
         both = noise * rng.standard_normal((2, rows, 2))
         registration: Any = _Profiles(profile, both)
-        estimator.add(registration, 1e9, (200, 200))
+        estimator, _ = estimator.add(registration, 1e9, (200, 200))
     return estimator.variance_px2()
 
 

@@ -26,12 +26,14 @@ import pytest
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftPath, DriftStatus
 from semcal_ros.core.drift.frame_time import (
-    SHEAR_OF_SHIFT_DISTORTED,
-    SHEAR_OF_SHIFT_RECTIFIED,
     FrameTimeEstimate,
     estimate_frame_time,
 )
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.thresholds import (
+    SHEAR_OF_SHIFT_DISTORTED,
+    SHEAR_OF_SHIFT_RECTIFIED,
+)
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.failures import MatchFailure

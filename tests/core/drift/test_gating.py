@@ -22,7 +22,6 @@ from scipy import stats
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.gating import (
-    GATE,
     OutlierTest,
     inflate_after_pause,
     inflate_if_contradicted,
@@ -30,6 +29,9 @@ from semcal_ros.core.drift.gating import (
 )
 from semcal_ros.core.drift.operations import Inflate
 from semcal_ros.core.drift.state import BASE_SIZE, DriftState
+from semcal_ros.core.drift.thresholds import (
+    INNOVATION_CHI2_MAX,
+)
 
 # Drift gets 2 units along x and 4 along y between two frames.
 REACH = np.diag([2.0, 4.0])
@@ -54,7 +56,7 @@ def opened(inflation: Inflate | None) -> tuple[Array, Array]:
 
 
 def test_the_gate_is_passed_once_in_a_million_frames() -> None:
-    assert stats.chi2.sf(GATE, 2) == pytest.approx(1e-6, rel=0.02)
+    assert stats.chi2.sf(INNOVATION_CHI2_MAX, 2) == pytest.approx(1e-6, rel=0.02)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -86,7 +88,7 @@ def test_without_a_known_keyframe_and_a_shift_nothing_is_contradicted(
 def test_a_shift_is_used_at_once_as_far_as_drift_gets_between_two_frames(
     miss: tuple[float, float], used: bool
 ) -> None:
-    inflation = OutlierTest().explain(at(5.0, (7.0, 8.0)), np.add((7.0, 8.0), miss), REACH, 4.5)
+    _, inflation = OutlierTest().explain(at(5.0, (7.0, 8.0)), np.add((7.0, 8.0), miss), REACH, 4.5)
     assert (inflation is not None) == used
     if used:
         position, velocity = opened(inflation)
@@ -96,10 +98,10 @@ def test_a_shift_is_used_at_once_as_far_as_drift_gets_between_two_frames(
 
 @pytest.mark.parametrize(("second", "used"), [(31.0, True), (29.0, True), (33.0, False)])
 def test_farther_away_it_must_be_seen_twice(second: float, used: bool) -> None:
-    test = OutlierTest()
-    test.reset(at(4.0, (0.0, 0.0)))
-    assert test.explain(at(5.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 4.0) is None
-    inflation = test.explain(at(6.0, (0.0, 0.0)), np.array([second, 0.0]), REACH, 4.0)
+    test = OutlierTest.after(at(4.0, (0.0, 0.0)))
+    test, first = test.explain(at(5.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 4.0)
+    assert first is None
+    _, inflation = test.explain(at(6.0, (0.0, 0.0)), np.array([second, 0.0]), REACH, 4.0)
     assert (inflation is not None) == used
     if used:
         np.testing.assert_allclose(opened(inflation)[0], second**2)
@@ -109,8 +111,9 @@ def test_farther_away_it_must_be_seen_twice(second: float, used: bool) -> None:
 def test_a_new_pace_is_believed_when_three_positions_show_it(third: float, used: bool) -> None:
     test = OutlierTest()
     for time_s, x in ((5.0, 20.0), (6.0, 40.0)):
-        assert test.explain(at(time_s, (0.0, 0.0)), np.array([x, 0.0]), REACH, 4.0) is None
-    inflation = test.explain(at(7.0, (0.0, 0.0)), np.array([third, 0.0]), REACH, 4.0)
+        test, none = test.explain(at(time_s, (0.0, 0.0)), np.array([x, 0.0]), REACH, 4.0)
+        assert none is None
+    _, inflation = test.explain(at(7.0, (0.0, 0.0)), np.array([third, 0.0]), REACH, 4.0)
     assert (inflation is not None) == used
     if used:
         # The pace of 20 per s, which the filter did not expect, and what drift may add to it.
@@ -120,14 +123,17 @@ def test_a_new_pace_is_believed_when_three_positions_show_it(third: float, used:
 def test_the_same_frame_against_another_keyframe_does_not_confirm_itself() -> None:
     test = OutlierTest()
     for _ in range(2):
-        assert test.explain(at(5.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 4.0) is None
+        test, inflation = test.explain(at(5.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 4.0)
+        assert inflation is None
 
 
 def test_an_expected_frame_makes_the_unexpected_ones_before_it_forgotten() -> None:
     test = OutlierTest()
-    assert test.explain(at(5.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 4.0) is None
-    test.reset(at(6.0, (0.0, 0.0)))
-    assert test.explain(at(7.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 6.0) is None
+    test, _ = test.explain(at(5.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 4.0)
+    # What would have confirmed the next one.
+    assert test.explain(at(7.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 6.0)[1] is not None
+    test = OutlierTest.after(at(6.0, (0.0, 0.0)))
+    assert test.explain(at(7.0, (0.0, 0.0)), np.array([30.0, 0.0]), REACH, 6.0)[1] is None
 
 
 def test_after_a_pause_drift_may_have_stopped_or_doubled_its_speed() -> None:

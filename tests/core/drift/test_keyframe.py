@@ -268,9 +268,18 @@ def test_a_keyframe_is_carried_only_between_cameras() -> None:
 # -- the store ----------------------------------------------------------------------------------
 
 
-def plain_store(**limits: int) -> KeyframeStore:
-    max_count, max_bytes = limits.get("max_count", 48), limits.get("max_bytes", 1 << 28)
-    return KeyframeStore(RegistrationSettings(), max_bytes, max_count)
+SETTINGS = RegistrationSettings()
+
+
+def add_within(
+    store: KeyframeStore, added: Keyframe, max_count: int = 48, max_bytes: int = 1 << 28
+) -> tuple[KeyframeStore, list[int]]:
+    """The store with a keyframe more, and the numbers of those that it has no room for any more."""
+    store = store.add(added)
+    gone = store.superfluous(max_bytes, max_count)
+    for key in gone:
+        store = store.forget(key)
+    return store, gone
 
 
 def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float]) -> DriftState:
@@ -281,10 +290,10 @@ def state_with(places: dict[int, tuple[float, float]], drift: tuple[float, float
 
 
 def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None:
-    store = plain_store()
+    store = KeyframeStore()
     picture = make_picture((0.0, 0.0), 3.0, 0)
     for _ in range(3):
-        store.add(keyframe(picture))
+        store = store.add(keyframe(picture))
     assert store.current == 2
     places = {0: (0.0, 0.0), 1: (80.0, 0.0), 2: (40.0, 0.0)}
     frame = ScanFrame(picture, None, None)
@@ -303,7 +312,7 @@ def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None
     # Parts of the width and of the height.
     assert found[0].overlap == pytest.approx((1.0 - 30.0 / SIZE) * (1.0 - 16.0 / SIZE))
     assert not any(c.rescaled for c in found)
-    store.use(0)
+    store = store.use(0)
     assert order(40.0)[0] == 0
     # A keyframe that the drift does not know is none.
     few = state_with({1: (80.0, 0.0)}, (0.0, 0.0))
@@ -314,12 +323,12 @@ def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None
 
 
 def test_keyframes_of_another_scale_come_last() -> None:
-    store = plain_store()
+    store = KeyframeStore()
     cameras = [small_camera(2000.0), small_camera(3000.0), small_camera(2000.0)]
     image = np.zeros((192, 192), np.uint8)
     for camera in cameras:
         frame = ScanFrame(image, camera, None)
-        store.add(make_keyframe(frame, NOWHERE, image, (0, 0, 192, 192), 0.0))
+        store = store.add(make_keyframe(frame, NOWHERE, image, (0, 0, 192, 192), 0.0))
     # At 3000x everything is in m; 1 um is 12 px.
     places = {0: (0.0, 0.0), 1: (0.0, 0.0), 2: (2e-6, 0.0)}
     state = state_with(places, (0.0, 0.0))
@@ -342,19 +351,21 @@ def test_keyframes_of_another_scale_come_last() -> None:
 
 
 def test_the_oldest_use_is_forgotten_but_never_the_first_or_the_one_in_use() -> None:
-    store = plain_store(max_count=3)
+    store = KeyframeStore()
     picture = make_picture((0.0, 0.0), 3.0, 0)
     gone: list[int] = []
     for number in range(3):
-        assert store.add(keyframe(picture)) == (number, [])
+        store, lost = add_within(store, keyframe(picture), max_count=3)
+        assert (store.latest, lost) == (number, [])
     # Keyframe 1 is looked at again, so that 2 was not used for the longest time.
-    store.use(1)
-    assert store.add(keyframe(picture)) == (3, [2])
-    assert store.add(keyframe(picture)) == (4, [1])
+    store = store.use(1)
+    for number, oldest in ((3, 2), (4, 1)):
+        store, lost = add_within(store, keyframe(picture), max_count=3)
+        assert (store.latest, lost) == (number, [oldest])
     for _ in range(10):
-        number, lost = store.add(keyframe(picture))
+        store, lost = add_within(store, keyframe(picture), max_count=3)
         gone += lost
-        assert store.current == number
+        assert store.current == store.latest
         assert len(store) == 3
     assert 0 not in gone
     assert store[0].averaged == 1
@@ -367,45 +378,44 @@ def test_memory_is_bounded_by_bytes() -> None:
     one = keyframe(picture).nbytes
     # The image as it came, and its mean: 4 bytes per pixel each.
     assert one == 2 * 4 * SIZE * SIZE
-    store = plain_store(max_bytes=int(4.5 * one))
+    store = KeyframeStore()
     for _ in range(12):
-        store.add(keyframe(picture))
+        store, _ = add_within(store, keyframe(picture), max_bytes=int(4.5 * one))
         assert len(store) <= 4
     assert len(store) == 4
     assert store[0].nbytes == one
     # However little memory there is, the first one and the one in use stay.
-    tight = plain_store(max_bytes=1)
+    tight = KeyframeStore()
     for _ in range(5):
-        tight.add(keyframe(picture))
+        tight, _ = add_within(tight, keyframe(picture), max_bytes=1)
     assert len(tight) == 2
     assert tight[0] is not tight[4]
 
 
 def test_a_reference_is_prepared_anew_when_its_mean_has_become_much_better() -> None:
-    store = plain_store()
+    store = KeyframeStore()
     picture = make_picture((0.0, 0.0), 3.0, 0)
-    key, _ = store.add(keyframe(picture))
-    first = store.reference(key)
-    assert store.reference(key) is first
+    store = store.add(keyframe(picture))
+    key = store.latest
+    store, first = store.reference(key, SETTINGS)
+    assert store.reference(key, SETTINGS)[1] is first
     assert store.averaged(key) == 1
     same = known((0.0, 0.0))
     prepared = []
     for k in range(1, 8):
-        store.replace(
-            key, store[key].with_frame(make_picture((0.0, 0.0), 3.0, k), EVERYTHING, same)
-        )
-        store.reference(key)
+        mean = store[key].with_frame(make_picture((0.0, 0.0), 3.0, k), EVERYTHING, same)
+        store, _ = store.replace(key, mean).reference(key, SETTINGS)
         prepared.append(store.averaged(key))
     assert prepared == [2, 2, 4, 4, 4, 4, 8]
     # Another motion taken out makes another image.
-    store.replace(key, replace(store[key], removed=np.ones(4)))
-    before = store.reference(key)
-    store.replace(key, replace(store[key], removed=np.zeros(4)))
-    assert store.reference(key) is not before
+    store = store.replace(key, replace(store[key], removed=np.ones(4)))
+    store, before = store.reference(key, SETTINGS)
+    store = store.replace(key, replace(store[key], removed=np.zeros(4)))
+    assert store.reference(key, SETTINGS)[1] is not before
     # Frames that show little of it, and those that would not matter, are not wanted.
     assert store.has_room(key, 0.8)
     assert not store.has_room(key, 0.7)
-    store.replace(key, replace(store[key], averaged=32))
+    store = store.replace(key, replace(store[key], averaged=32))
     assert not store.has_room(key, 1.0)
 
 

@@ -127,17 +127,25 @@ def test_nothing_is_said_across_a_change_of_scale_or_of_what_moves() -> None:
     velocity = np.array([2.5, 1.0])
     first, second = body_frame(velocity, 0, 0.0), body_frame(velocity, 1, 1.0)
     estimator = OwnMotionEstimator()
-    assert estimator.update(first) is None
-    assert estimator.update(second) is None
+    frames = [first, second, replace(first, time_s=2.0), replace(second, time_s=3.0)]
+    known = []
+    for frame in frames:
+        estimator = estimator.update(frame)
+        known.append(estimator.latest is not None)
     # The first time tells where to look, the second one confirms it.
-    assert estimator.update(replace(first, time_s=2.0)) is None
-    assert estimator.update(replace(second, time_s=3.0)) is not None
-    assert estimator.update(None) is None
-    assert estimator.update(first) is None
-    assert estimator.update(replace(second, px_from_unit=2.0 * np.eye(2))) is None
+    assert known == [False, False, False, True]
+    assert estimator.update(None) == OwnMotionEstimator()
+    time_s = 4.0
+    while estimator.base is None:
+        estimator = estimator.update(replace(first, time_s=time_s))
+        time_s += 1.0
+    assert estimator.latest is not None
+    rescaled = replace(second, time_s=time_s, px_from_unit=2.0 * np.eye(2))
+    assert estimator.update(rescaled).latest is None
 
 
 def test_what_moves_as_the_specimen_does_is_not_told_from_it() -> None:
     estimator = OwnMotionEstimator()
     for k in range(6):
-        assert estimator.update(body_frame(DRIFT, k % 2, float(k))) is None
+        estimator = estimator.update(body_frame(DRIFT, k % 2, float(k)))
+        assert estimator.latest is None

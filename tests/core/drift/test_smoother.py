@@ -303,7 +303,7 @@ def test_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = smooth(initial_state(0.0), events, process_noise)
     # Blocks that end with all kinds of events, and one that is exactly full.
     for block in (1, 7, len(events) - 1, len(events)):
-        monkeypatch.setattr(smoother, "_BLOCK", block)
+        monkeypatch.setattr(smoother, "SMOOTHER_BLOCK", block)
         for one, other in zip(
             whole, smooth(initial_state(0.0), events, process_noise), strict=True
         ):
@@ -314,7 +314,7 @@ def test_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_memory_does_not_grow_with_the_frames_times_the_keyframes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(smoother, "_BLOCK", 30)
+    monkeypatch.setattr(smoother, "SMOOTHER_BLOCK", 30)
     process_noise = ProcessNoise(0.3, 2.0)
     events: list[Event] = [AddKeyframe(key, np.zeros(4), 0.0, np.eye(4), 0.0) for key in range(12)]
     for k in range(120):

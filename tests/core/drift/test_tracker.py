@@ -28,9 +28,11 @@ from scipy import ndimage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.frame import MotionCorrector
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.keyframe_store import Candidate
+from semcal_ros.core.drift.remade_keyframes import correct_shear
 from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.drift.tracker_state import TrackerSetup
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.failures import MatchFailure
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, lattice, noisy, small_camera
@@ -188,18 +190,16 @@ def test_an_absurd_velocity_is_not_taken_out_of_a_keyframe() -> None:
     """Seen with a stage that steps fast under a charging specimen: the tracker raised "drift of 5.5e+03 px/s"."""
     run = Run((0.0, 0.0))
     run.step(0)
-    track = run.tracker._track
-    assert track is not None
-    (key,) = track.filter.state.keys
-
-    class Absurd:
-        """The keyframe moved by 20 000 px in a second."""
-
-        def keyframe_state(self, _key: int) -> np.ndarray:
-            return np.array([0.0, 0.0, 2e-3, 2e-3])
-
-    candidate = Candidate(key, 1.0, 1.0)
-    assert not run.tracker._correct_keyframe(track, candidate, Absurd())  # type: ignore[arg-type]  # all that is asked
+    state = run.tracker.state
+    assert state is not None
+    drift = state.filter.state
+    (key,) = drift.keys
+    mean = drift.mean.copy()
+    # The keyframe moved by 20 000 px in a second.
+    mean[drift.keyframe_slice(key)] = [0.0, 0.0, 2e-3, 2e-3]
+    setup = TrackerSetup(DriftSettings(), MotionCorrector("cubic"), keeps_history=False)
+    after, corrected = correct_shear(setup, state, key, replace(drift, mean=mean))
+    assert not corrected and after is state
 
 
 def test_goes_on_at_another_place_after_a_while() -> None:

@@ -1,0 +1,129 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Frames that do not match: the drift goes on as predicted, the specimen is lost, and tracking starts again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.drift.estimates import DriftStatus, DriftUpdate
+from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.drift.gating import OutlierTest, inflate_if_contradicted, inflate_when_lost
+from semcal_ros.core.drift.matching import RejectedMatch
+from semcal_ros.core.drift.measurement import is_removable
+from semcal_ros.core.drift.new_keyframes import add_keyframe, prepare_keyframe
+from semcal_ros.core.drift.thresholds import (
+    INTERVAL_S_MIN,
+)
+from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
+
+# What an image looks like that shows another place: the prediction need not hold.
+_ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
+
+
+def coast(
+    setup: TrackerSetup,
+    state: TrackerState,
+    frame: ScanFrame,
+    rejected: list[RejectedMatch],
+    *,
+    rescaled: bool,
+) -> tuple[TrackerState, DriftUpdate]:
+    """Keep the prediction, with a larger covariance where the image contradicts it; start
+    again from it where the frame or its scale is lost.
+    """
+    # The first one is that of the best keyframe.
+    rejection, registration = rejected[0].rejection, rejected[0].registration
+    doubt = _doubt(setup, state, frame, rejected)
+    # A blanked beam says nothing about the keyframe.
+    is_of_keyframe = rejection.status not in IMAGE_FAILURES
+    last_s, drift = state.time_s, state.filter.state
+    state = replace(
+        state,
+        doubt=state.doubt if doubt is None else doubt,
+        body=state.body.update(None),
+        rejected=state.rejected + is_of_keyframe,
+    )
+    since_s = max(drift.time_s - last_s, INTERVAL_S_MIN)
+    is_lost = state.rejected >= setup.settings.lost_after
+    if is_lost:
+        speed_px_s = setup.settings.first_step_px / since_s
+        inflation = inflate_when_lost(frame.px_from_unit, _reach_px(setup, frame), speed_px_s)
+        state = state.inflate(inflation)
+    else:
+        nearest = np.asarray(np.linalg.solve(frame.px_from_unit, registration.nearest_px))
+        contradicted = inflate_if_contradicted(drift, state.keyframes.current, nearest, since_s)
+        if contradicted is not None:
+            state = state.inflate(contradicted)
+    if is_lost or (rescaled and is_of_keyframe):
+        return restart(setup, state, frame, rejection)
+    return state, make_update(
+        state, frame, DriftStatus.COASTING, rejection, registration=registration
+    )
+
+
+def _reach_px(setup: TrackerSetup, frame: ScanFrame) -> float:
+    """How far away the place may be that an image shows which matches nothing."""
+    return setup.settings.max_jump * max(frame.size)
+
+
+def _doubt(
+    setup: TrackerSetup, state: TrackerState, frame: ScanFrame, rejected: list[RejectedMatch]
+) -> Array | None:
+    """By how much, as a (2, 2) covariance, the drift may be off where an image does not match; None
+    where the image says nothing about that.
+    """
+    disputed = next((r.disputed for r in rejected[::-1] if r.disputed is not None), None)
+    if disputed is not None:
+        return disputed
+    best = rejected[0]
+    if best.rejection.status not in _ELSEWHERE:
+        return None
+    if best.rejection.status is MatchFailure.NO_PEAK:
+        motion = state.filter.state.motion
+        removed = motion if is_removable(motion, frame) else np.zeros(4)
+        if prepare_keyframe(setup, state, frame, removed)[1].defect:
+            # Noise matches nothing, wherever the specimen is.
+            return None
+    unit = np.linalg.inv(frame.px_from_unit) * _reach_px(setup, frame)
+    return np.asarray(unit @ unit.T)
+
+
+def restart(
+    setup: TrackerSetup,
+    state: TrackerState,
+    frame: ScanFrame,
+    rejection: Rejection[MatchFailure],
+) -> tuple[TrackerState, DriftUpdate]:
+    """Go on from the predicted drift with this frame as keyframe."""
+    unmatched = state.filter.pending
+    state, defect = add_keyframe(setup, state, frame, state.filter.state.motion)
+    if defect is None:
+        if unmatched is not None and len(state.keyframes) > 2:
+            # No frame has ever matched it.
+            state = state.forget(unmatched)
+        state = replace(state, rejected=0, outliers=OutlierTest())
+    return state, make_update(
+        state,
+        frame,
+        DriftStatus.COASTING,
+        defect or rejection,
+        restarted=defect is None,
+    )

@@ -1,0 +1,150 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What does not show the specimen and never moves: what is drawn into the frames, and what else stays in place.
+
+The first is looked for in the first frames and now and then (:mod:`.overlay`), the second as soon as the specimen has
+moved (:mod:`.fixed_parts`). Both are left out of a frame, and out of keyframes that were made before they were found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.drift.fixed_parts import (
+    find_fixed_parts,
+    share_of_gradients,
+)
+from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.thresholds import (
+    FIXED_EVERY_FRAMES_MAX,
+    FIXED_FIRST,
+    FIXED_MOVE_PX_MIN,
+    NEWLY_FIXED,
+    OVERLAY_EVERY_FRAMES,
+    OVERLAY_FIRST_FRAMES,
+)
+
+
+@dataclass(frozen=True)
+class EarlierFrame:
+    """A frame to compare later ones with: its image as it came, and its drift (2,), px.
+
+    ``px_from_unit`` (2, 2) tells its scale, and ``since`` is the number of frames that were measured since.
+    """
+
+    image: AnyImage
+    drift_px: Array
+    px_from_unit: Array
+    since: int = 0
+
+
+@dataclass(frozen=True)
+class StaticParts:
+    """What is known of what never moves.
+
+    Attributes
+    ----------
+    frames
+        Number of frames since the first.
+    before
+        The last frame as it came, where the next one is compared with it.
+    overlay
+        (h, w) what is drawn into all frames; None where nothing was found.
+    fixed
+        (h, w) what else stays in place; None where nothing was found.
+    earlier
+        The frame that the next one is compared with for that.
+    comparisons
+        Number of such comparisons.
+    """
+
+    frames: int = 0
+    before: AnyImage | None = None
+    overlay: Mask | None = None
+    fixed: Mask | None = None
+    earlier: EarlierFrame | None = None
+    comparisons: int = 0
+
+    def remove_from(self, frame: ScanFrame) -> ScanFrame:
+        """The frame with the place of what does not show the specimen filled from around, as far as it is known."""
+        masks = [m for m in (self.overlay, self.fixed) if m is not None]
+        masks = [m for m in masks if m.shape == frame.image.shape[:2]]
+        fixed = np.logical_or.reduce(masks) if masks else np.zeros(1, dtype=bool)
+        if not np.any(fixed):
+            return frame
+        return replace(frame, image=remove_overlay(frame.image, fixed), fixed=fixed)
+
+    def look_for_overlay(self, image: AnyImage) -> tuple[StaticParts, bool]:
+        """Look in one frame more for what is drawn into them; whether any was found for the first time."""
+        frames = self.frames + 1
+        parts = replace(self, frames=frames)
+        looks = frames <= OVERLAY_FIRST_FRAMES or frames % OVERLAY_EVERY_FRAMES == 0
+        if not looks or self.before is None or np.array_equal(self.before, image):
+            return parts, False
+        found = find_overlay(self.before, image)
+        return replace(parts, overlay=found), found is not None and self.overlay is None
+
+    def keep(self, image: AnyImage) -> StaticParts:
+        """Keep a frame as it came, where the next one is compared with it."""
+        if self.frames < OVERLAY_FIRST_FRAMES or (self.frames + 1) % OVERLAY_EVERY_FRAMES == 0:
+            return replace(self, before=image.copy())
+        return self
+
+    def look_for_fixed(
+        self, image: AnyImage, drift_px: Array, px_from_unit: Array
+    ) -> tuple[StaticParts, Array | None]:
+        """Look for what stays in place between a frame that was measured, as it came, and an earlier one, once the
+        specimen has moved.
+
+        Parameters
+        ----------
+        image
+            (h, w) or (h, w, 3) frame.
+        drift_px
+            (2,) its drift.
+        px_from_unit
+            (2, 2) its scale.
+
+        Returns
+        -------
+        What is known now, and (2,) by how much what is new has pulled the drift, px: towards its own place, by its part
+        of the structure. None where nothing is new.
+        """
+        parts, earlier, pulled_px = self, self.earlier, None
+        if (
+            earlier is not None
+            and earlier.image.shape == image.shape
+            and np.allclose(earlier.px_from_unit, px_from_unit)
+        ):
+            since = earlier.since + 1
+            every = min(1 + max(0, self.comparisons - FIXED_FIRST), FIXED_EVERY_FRAMES_MAX)
+            moved_px = drift_px - earlier.drift_px
+            if since < every or np.hypot(*moved_px) < FIXED_MOVE_PX_MIN:
+                return replace(self, earlier=replace(earlier, since=since)), None
+            parts = replace(self, comparisons=self.comparisons + 1)
+            found = find_fixed_parts(earlier.image, image, moved_px)
+            if found is not None:
+                known = np.zeros_like(found.stays) if self.fixed is None else self.fixed
+                parts = replace(parts, fixed=found.stays | (known & ~found.moves))
+                if float(np.mean(found.stays & ~known)) > NEWLY_FIXED:
+                    pulled_px = share_of_gradients(image, found.stays) * moved_px
+        elif self.fixed is not None and self.fixed.shape != image.shape[:2]:
+            parts = replace(self, fixed=None)
+        latest = EarlierFrame(image.copy(), drift_px, px_from_unit)
+        return replace(parts, earlier=latest), pulled_px
