@@ -50,9 +50,6 @@ MEDIAN_CHI2_2 = 2.0 * math.log(2.0)
 #: Derived: the same by the number of degrees of freedom: of the square of one normal deviate, and of two.
 MEDIAN_CHI2 = {1: 0.45493642, 2: MEDIAN_CHI2_2}
 
-#: Derived: Tukey's constant for his biweight, in sigmas, for an efficiency of 95 % with normal noise (Holland and
-#: Welsch 1977, doi:10.1080/03610927708827533).
-TUKEY_CONSTANT = 4.685
 # Derived: standard deviations of a normal distribution per median absolute deviation: 1 / Phi^-1(3/4).
 _SIGMAS_PER_MAD = 1.4826
 # Stated: characters of a wrong value in an error, which is one line.

@@ -26,7 +26,7 @@ from scipy.integrate import trapezoid
 from semcal_ros.applications.cantilever import thresholds as cantilever
 from semcal_ros.applications.reconstruction import thresholds as reconstruction
 from semcal_ros.applications.servoing import thresholds as servoing
-from semcal_ros.core.arrays import TUKEY_CONSTANT
+from semcal_ros.core.robust_losses import TUKEY_CONSTANT
 
 BOTH_SIDES = 2.0
 

@@ -49,8 +49,9 @@ from semcal_ros.applications.cantilever.thresholds import (
     TINY,
     WEIGHT_MIN,
 )
-from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, Mask, mad_sigma
+from semcal_ros.core.arrays import Array, Mask, mad_sigma
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.robust_losses import tukey_weight
 from semcal_ros.core.wording import did_you_mean
 
 SHAPES = ("free", "beam", "parabola")
@@ -367,8 +368,7 @@ def _fit_robustly(
         residual = (seen - rows @ solution) / sigma
         scale = max(mad_sigma(residual), 0.8)
         # The first rounds do not yet know what is an outlier.
-        far = residual / (scale * TUKEY_CONSTANT * (2.0 if iteration < 3 else 1.0))
-        weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
+        weight = tukey_weight(residual, scale * (2.0 if iteration < 3 else 1.0))
         if int(np.count_nonzero(weight > WEIGHT_MIN)) < EDGES_MIN:
             return None
     # The sandwich formula: the weights cost a little more than the plain inverse says.

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from semcal_ros.core.arrays import TUKEY_CONSTANT
+from semcal_ros.core.robust_losses import TUKEY_CONSTANT
 from semcal_ros.core.thresholds import Table
 
 TABLE = Table()

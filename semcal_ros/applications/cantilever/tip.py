@@ -51,7 +51,8 @@ from semcal_ros.applications.cantilever.thresholds import (
     TIP_STEPS,
     WEIGHT_MIN,
 )
-from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, mad_sigma
+from semcal_ros.core.arrays import Array, mad_sigma
+from semcal_ros.core.robust_losses import tukey_loss, tukey_weight
 
 #: Coordinates along and across the axis, m, and grey levels, (n,) each.
 PixelSamples = tuple[Array, Array, Array]
@@ -379,10 +380,9 @@ def _solve_robustly(
         solution = inverse @ ((design * total[:, None]).T @ seen + known * expected)
         left = (seen - design @ solution) / sigma
         scale = max(mad_sigma(left), 1.0)
-        far = left / (scale * TUKEY_CONSTANT * (2.0 if iteration < 2 else 1.0))
-        weight = np.where(np.abs(far) < 1.0, (1.0 - far**2) ** 2, 0.0)
+        weight = tukey_weight(left, scale * (2.0 if iteration < 2 else 1.0))
         if int(np.count_nonzero(weight > WEIGHT_MIN)) < design.shape[1] + BLOCKS_SPARE:
             return None
     # Of a rejected block counts what Tukey's loss counts.
-    loss = LOSS_MAX * (1.0 - np.clip(1.0 - far**2, 0.0, 1.0) ** 3)
-    return np.asarray(solution), np.asarray(inverse), float(loss.sum()) * scale**2, scale
+    chi2 = 2.0 * float(np.sum(tukey_loss(left, scale))) * scale**2
+    return np.asarray(solution), np.asarray(inverse), chi2, scale

@@ -36,6 +36,7 @@ from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, St
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.robust_losses import cauchy_loss, cauchy_weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,9 @@ class _Problem:
     def cost(self, state: _State, sigma: float) -> float:
         white = self.whiten(self.residuals(state)[0]) / sigma
         priors = np.sum(self.heights(state) ** 2) + np.sum(self.depths(state) ** 2)
-        return _compute_loss(white) + 0.5 * float(priors)
+        return float(np.sum(cauchy_loss(np.sum(white**2, axis=1), CAUCHY_SIGMAS))) + 0.5 * float(
+            priors
+        )
 
     def normal(self, state: _State, sigma: float) -> tuple[Array, Array, Array, Array, Array]:
         """Form the blocks of the normal equations: poses (v, 6, 6), points (p, 3, 3), coupling
@@ -169,7 +172,7 @@ class _Problem:
         predicted = seen.xy - error
         by_xyz[:, :, 2] = -(rho / w)[:, None] * (predicted - np.stack([px, py], axis=1))
         white = self.whiten(error) / sigma
-        weight = 1.0 / (1.0 + np.sum(white**2, axis=1) / CAUCHY_SIGMAS**2)
+        weight = cauchy_weight(np.sum(white**2, axis=1), CAUCHY_SIGMAS)
         root = seen.root * (np.sqrt(weight) / sigma)[:, None, None]
         rows = root @ by_xyz
         error = np.einsum("nij,nj->ni", root, error)
@@ -316,11 +319,6 @@ def _estimate_scale(problem: _Problem, state: _State) -> float:
     return max(float(scale), SCALE_MIN)
 
 
-def _compute_loss(white: Array) -> float:
-    squared = np.sum(white**2, axis=1)
-    return 0.5 * CAUCHY_SIGMAS**2 * float(np.sum(np.log1p(squared / CAUCHY_SIGMAS**2)))
-
-
 def _multiply_outer(a: Array, b: Array) -> Array:
     return np.asarray(np.swapaxes(a, 1, 2) @ b, dtype=np.float64)
 
@@ -365,7 +363,7 @@ def _finish(
         translations_m=state.translations * unit_m,
         points_m=state.points * unit_m,
         residuals=error,
-        weights=1.0 / (1.0 + np.sum(white**2, axis=1) / CAUCHY_SIGMAS**2),
+        weights=cauchy_weight(np.sum(white**2, axis=1), CAUCHY_SIGMAS),
         sigma=sigma,
         cost=problem.cost(state, sigma),
         point_covariance_m2=covariance,

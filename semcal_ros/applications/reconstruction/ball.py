@@ -64,8 +64,9 @@ from semcal_ros.applications.reconstruction.thresholds import (
     SPHERE_TRIALS,
 )
 from semcal_ros.applications.reconstruction.types import Observations
-from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, Indices, Mask, mad_sigma
+from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.robust_losses import huber_weight, tukey_weight
 from semcal_ros.core.wording import counted
 
 
@@ -576,13 +577,10 @@ class _SphereResiduals:
             error = np.abs(self.height - design @ (rows @ self.height))
             error /= np.maximum(1.0 - leverage, FREEDOM_MIN)
             scale = max(mad_sigma(error), 1e-15)
-            if turn < ROBUST_ROUNDS:
-                limit = HEIGHT_SIGMAS * scale
-                weight = limit / np.maximum(error, limit)
-            else:
+            weight = huber_weight(error, HEIGHT_SIGMAS * scale)
+            if turn >= ROBUST_ROUNDS:
                 # What is far off by then counts for nothing.
-                limit = TUKEY_CONSTANT * scale
-                weight = np.maximum(1.0 - (error / limit) ** 2, 0.0) ** 2
+                weight = tukey_weight(error, scale)
         solution = np.asarray(rows @ self.height, dtype=np.float64)
         return solution, np.asarray(rows, dtype=np.float64)
 

@@ -50,6 +50,7 @@ from semcal_ros.applications.reconstruction.thresholds import (
 from semcal_ros.applications.reconstruction.types import Tracks
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
+from semcal_ros.core.robust_losses import huber_weight
 from semcal_ros.core.wording import counted
 
 # Reverses depth.
@@ -178,7 +179,7 @@ class _GrowingStructure:
         """Compute (views, points) Huber weights; zero for unused observations."""
         error, used = self._residuals()
         size = np.linalg.norm(error, axis=2) / self.sigma
-        return np.where(used, HUBER_SIGMAS / np.maximum(size, HUBER_SIGMAS), 0.0)
+        return np.where(used, huber_weight(size, HUBER_SIGMAS), 0.0)
 
     def place_views(self, wanted: Mask, weights: Array | None = None) -> None:
         """Fit cameras that see enough placed points by least squares."""

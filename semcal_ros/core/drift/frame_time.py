@@ -66,6 +66,7 @@ from semcal_ros.core.drift.thresholds import (
     TIMED_FRAMES_MIN,
 )
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.robust_losses import huber_weight
 from semcal_ros.core.wording import counted
 
 
@@ -265,7 +266,7 @@ def _fit_robustly(observed: _Observations, shear_of_shift: float, interval_s: fl
         chi2 = float(np.median(solution.squares)) / MEDIAN_CHI2_2
         sigma = float(np.sqrt(solution.covariance[0, 0]))
         normal = np.sqrt(solution.squares / max(chi2, 1.0))
-        trust = np.minimum(1.0, HUBER_SIGMAS / np.maximum(normal, 1e-9))
+        trust = huber_weight(normal, HUBER_SIGMAS)
         if step > 1 and abs(time_s - before) < CONVERGED_SIGMAS * sigma:
             converged = True
             break

@@ -46,6 +46,7 @@ from semcal_ros.core.camera.projection import (
     project_points,
     project_points_with_jacobians,
 )
+from semcal_ros.core.robust_losses import huber_loss, huber_weight
 
 
 @dataclass(frozen=True)
@@ -208,15 +209,13 @@ def whitened_norm(problem: Problem, residuals_px: Array) -> Array:
 
 
 def _huber(norm: Array) -> tuple[Array, Array]:
-    """Return Huber's loss (half the squared norm inside) and weight of whitened residual norms.
+    """Return Huber's loss and weight of whitened residual norms.
 
     A point without a projection has a large loss and no weight.
     """
     seen = np.isfinite(norm)
     norm = np.where(seen, norm, 0.0)
-    outside = norm > HUBER_SIGMAS
-    loss = np.where(outside, HUBER_SIGMAS * (norm - 0.5 * HUBER_SIGMAS), 0.5 * norm * norm)
-    weight = np.where(outside, HUBER_SIGMAS / np.maximum(norm, HUBER_SIGMAS), 1.0)
+    loss, weight = huber_loss(norm, HUBER_SIGMAS), huber_weight(norm, HUBER_SIGMAS)
     return np.where(seen, loss, LOSS_LOST), np.where(seen, weight, 0.0)
 
 
