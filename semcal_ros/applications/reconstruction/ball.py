@@ -29,7 +29,6 @@ Two smooth departures from the sphere are looked for. An *ellipsoid* leaves a qu
 degree 2. A *bump* or a dent leaves a mean that is not zero in a window. Each is divided by its own covariance, in which
 the errors of the poses matter most: an error of the turns stretches all depths alike, which looks like an
 ellipsoid. What the points scatter beyond their own uncertainty is added.
-
 """
 
 from __future__ import annotations

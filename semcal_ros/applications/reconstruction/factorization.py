@@ -29,7 +29,6 @@ parallel projection, whatever the number of views:
   :attr:`MetricUpgrade.condition`;
 - the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well:
   :func:`mirror_structure`.
-
 """
 
 from __future__ import annotations
