@@ -40,7 +40,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.special import chdtrc, chdtri, ndtr, stdtrit
 
-from semcal_ros.applications.reconstruction.adjustment import adjust
+from semcal_ros.applications.reconstruction.adjustment import Observations, adjust
 from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.surface import (
     SurfaceMesh,
@@ -62,7 +62,6 @@ from semcal_ros.applications.reconstruction.thresholds import (
     SPHERE_POINTS_MIN,
     SPHERE_TRIALS,
 )
-from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import TUKEY_CONSTANT, Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.wording import counted
