@@ -22,7 +22,6 @@ Of the shared memory, the default is judged, and a profile that states the size 
 does. The rules for everything else (built-in transports by name, socket buffers) differ between versions of Fast DDS
 and are left to its documentation:
 https://fast-dds.docs.eprosima.com (shared memory transport, XML profiles, environment variables).
-
 """
 
 from __future__ import annotations
@@ -46,7 +45,9 @@ MALLOC_VARIABLES = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
 # From here on the page faults of new buffers cost as much as all the rest of the way (the table of
 # doc/nodes.md: at 1 MiB the profile alone takes 2.1 times as long as with malloc set, at 512 KiB 1.4).
 _MALLOC_MATTERS_BYTES = 1024 * 1024
-_REMEDY = "set the environment of `Large images` (doc/nodes.md) for every process with images"
+_LARGE_IMAGES_REMEDY = (
+    "set the environment of `Large images` (doc/nodes.md) for every process with images"
+)
 _OTHER_MALLOC = re.compile("jemalloc|tcmalloc|mimalloc")
 DEFAULT_SEGMENT_BYTES = 512 * 1024
 """Shared memory of a Fast DDS participant that nobody has configured."""
@@ -61,11 +62,11 @@ _VERSIONS = {
     3: ("fastdds", "DEFAULT_FASTDDS_PROFILES.xml"),
 }
 
-_VARIABLE = "AMENT_PREFIX_PATH"
-_MARKER = Path("share", "ament_index", "resource_index", "packages", "semcal_ros")
+_PREFIX_VARIABLE = "AMENT_PREFIX_PATH"
+_SUITE_MARKER = Path("share", "ament_index", "resource_index", "packages", "semcal_ros")
 
 
-_added: list[str] = []
+_added_prefixes: list[str] = []
 
 
 def transport_advice(image_bytes: int, environment: Mapping[str, str], rmw: str) -> str:
@@ -85,7 +86,7 @@ def transport_advice(image_bytes: int, environment: Mapping[str, str], rmw: str)
         advice.append(_segment_advice(image_bytes, environment))
     advice.append(_malloc_advice(image_bytes, environment))
     found = [text for text in advice if text]
-    return "; ".join([*found, _REMEDY]) if found else ""
+    return "; ".join([*found, _LARGE_IMAGES_REMEDY]) if found else ""
 
 
 def _segment_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
@@ -98,8 +99,8 @@ def _segment_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
     if memory.segment_bytes is None or image_bytes <= memory.segment_bytes:
         return ""
     return (
-        f"images of {_size(image_bytes)} do not fit into the shared memory of Fast DDS,"
-        f" {_size(memory.segment_bytes)} ({memory.source})"
+        f"images of {_format_mib(image_bytes)} do not fit into the shared memory of Fast DDS,"
+        f" {_format_mib(memory.segment_bytes)} ({memory.source})"
     )
 
 
@@ -108,11 +109,11 @@ def _malloc_advice(image_bytes: int, environment: Mapping[str, str]) -> str:
     other = _OTHER_MALLOC.search(environment.get("LD_PRELOAD", ""))
     if image_bytes < _MALLOC_MATTERS_BYTES or tuned or other or not _has_glibc():
         return ""
-    small = [name for name in MALLOC_VARIABLES if _number(environment.get(name)) < image_bytes]
+    small = [name for name in MALLOC_VARIABLES if _read_number(environment.get(name)) < image_bytes]
     if not small:
         return ""
     return (
-        f"images of {_size(image_bytes)} get new memory from the kernel each time"
+        f"images of {_format_mib(image_bytes)} get new memory from the kernel each time"
         f" ({' and '.join(small)} not set so high)"
     )
 
@@ -124,11 +125,11 @@ def _has_glibc() -> bool:
         return False
 
 
-def _number(text: str | None) -> int:
+def _read_number(text: str | None) -> int:
     return int(text) if text is not None and text.isdecimal() else 0
 
 
-def _size(count: int) -> str:
+def _format_mib(count: int) -> str:
     return f"{count / 1024**2:.1f} MiB"
 
 
@@ -226,8 +227,8 @@ def check_security(environment: Mapping[str, str] = os.environ) -> None:
     ConfigError
         ``ROS_SECURITY_ENABLE`` or ``ROS_SECURITY_STRATEGY`` is misspelt, or there is no keystore.
     """
-    enabled = _one_of(environment, "ROS_SECURITY_ENABLE", "true", "false")
-    strategy = _one_of(environment, "ROS_SECURITY_STRATEGY", "Enforce", "Permissive")
+    enabled = _read_choice(environment, "ROS_SECURITY_ENABLE", "true", "false")
+    strategy = _read_choice(environment, "ROS_SECURITY_STRATEGY", "Enforce", "Permissive")
     if (enabled, strategy) == ("true", "Enforce") and not environment.get("ROS_SECURITY_KEYSTORE"):
         raise ConfigError(
             "ROS_SECURITY_KEYSTORE is not set",
@@ -236,7 +237,7 @@ def check_security(environment: Mapping[str, str] = os.environ) -> None:
         )
 
 
-def _one_of(environment: Mapping[str, str], name: str, *accepted: str) -> str:
+def _read_choice(environment: Mapping[str, str], name: str, *accepted: str) -> str:
     value = environment.get(name, "")
     if value and value not in accepted:
         raise ConfigError(
@@ -274,12 +275,16 @@ def add_environment_prefix() -> None:
     The setup script of a ROS installation or of a workspace sets the variable for what it holds. An environment that
     pip made has no such script, so the suite's executables and commands call this first. Child processes inherit it.
     """
-    prefixes = [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p]
-    if sys.prefix not in prefixes and (Path(sys.prefix) / _MARKER).is_file():
-        os.environ[_VARIABLE] = os.pathsep.join([sys.prefix, *prefixes])
-        _added.append(sys.prefix)
+    prefixes = [p for p in os.environ.get(_PREFIX_VARIABLE, "").split(os.pathsep) if p]
+    if sys.prefix not in prefixes and (Path(sys.prefix) / _SUITE_MARKER).is_file():
+        os.environ[_PREFIX_VARIABLE] = os.pathsep.join([sys.prefix, *prefixes])
+        _added_prefixes.append(sys.prefix)
 
 
 def prefixes_of_user() -> list[str]:
     """Return the prefixes of ``AMENT_PREFIX_PATH`` that :func:`add_environment_prefix` did not put there."""
-    return [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p and p not in _added]
+    return [
+        p
+        for p in os.environ.get(_PREFIX_VARIABLE, "").split(os.pathsep)
+        if p and p not in _added_prefixes
+    ]

@@ -25,7 +25,7 @@ from typing import Annotated
 import click
 
 from semcal_ros.calibration import Calibration
-from semcal_ros.cli.options import config_option, options_of, refuse_with, require_folder
+from semcal_ros.cli.options import config_option, needs_ros, options_of, refuse_with, require_folder
 from semcal_ros.config.config import load_config
 from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.errors import InvalidValueError, SemcalError
@@ -194,14 +194,8 @@ def command(options: AcquisitionOptions, config: str) -> None:
     """
     options.check()
     load_config(config)
-    try:
+    with needs_ros("rclpy for a live microscope"):
         from semcal_ros.nodes.acquire import run_acquisition
-    except ImportError as error:
-        raise SemcalError(
-            f"ROS 2 cannot be imported ({error})",
-            expected="rclpy for a live microscope",
-            do="source a ROS 2 workspace or run `make setup`",
-        ) from error
     arguments = ["--ros-args", "-r", f"__ns:={options.namespace}", "--log-level", "error"]
     for name, value in options.node_parameters(config).items():
         arguments += ["-p", f"{name}:={value}"]

@@ -25,7 +25,7 @@ from typing import Any
 
 import click
 
-from semcal_ros.cli.options import PATH, json_option, options_of, parse_ratio, refuse_grid_options
+from semcal_ros.cli.options import PATH, json_option, options_of, refuse_grid_options
 from semcal_ros.cli.output import (
     echo_json,
     echo_notes,
@@ -40,7 +40,7 @@ from semcal_ros.core.calibration.judgement.check import CalibrationCheck, Change
 from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import CheckOptions, check_recording
-from semcal_ros.workflows.check_specimen import STAGE_ACCURACY, MovesCheck, check_specimen
+from semcal_ros.workflows.check_specimen import MovesCheck, SpecimenCheckOptions, check_specimen
 
 _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
 
@@ -55,14 +55,7 @@ _UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
     help="RECORDING shows one place of any specimen at several magnifications, or under moves of the stage, not the "
     "grid: compare their scales, or the pixels with the moves.",
 )
-@click.option(
-    "--stage-accuracy",
-    callback=parse_ratio,
-    default=f"{100.0 * STAGE_ACCURACY:g}%",
-    show_default=True,
-    metavar="RATIO",
-    help="With --specimen: relative 1-sigma of a move of the stage along either of its axes.",
-)
+@options_of(SpecimenCheckOptions, "known")
 @json_option
 def command(
     calibration: Path,
@@ -70,7 +63,7 @@ def command(
     config: MicroscopeConfig,
     options: CheckOptions,
     specimen: bool,
-    stage_accuracy: float,
+    known: SpecimenCheckOptions,
     as_json: bool,
 ) -> None:
     """Whether CALIBRATION still holds, by one or more views of the grid in RECORDING.
@@ -87,7 +80,7 @@ def command(
     """
     if specimen:
         refuse_grid_options("--specimen compares images of any specimen")
-        _check_specimen(calibration, recording, config, stage_accuracy, as_json=as_json)
+        _check_specimen(calibration, recording, replace(known, config=config), as_json=as_json)
         return
     with show_progress() as on_progress:
         done = check_recording(
@@ -114,19 +107,13 @@ def command(
 def _check_specimen(
     calibration: Path,
     recording: RecordedFiles,
-    config: MicroscopeConfig,
-    stage_accuracy: float,
+    known: SpecimenCheckOptions,
     *,
     as_json: bool,
 ) -> None:
     with show_progress() as on_progress:
-        done = check_specimen(
-            calibration,
-            recording,
-            config=config,
-            stage_accuracy=stage_accuracy,
-            on_progress=on_progress,
-        )
+        known = replace(known, on_progress=on_progress)
+        done = check_specimen(calibration, recording, **vars(known))
     if as_json:
         echo_json(
             {
@@ -161,7 +148,7 @@ def _check_specimen(
             click.echo(
                 "a change that is common to all magnifications is not seen: that needs the grid"
             )
-        _echo_moves(done.moves, stage_accuracy)
+        _echo_moves(done.moves, known.stage_accuracy)
         echo_notes(done.notes)
     if not done.holds:
         sys.exit(1)

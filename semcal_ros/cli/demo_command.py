@@ -19,38 +19,37 @@ from __future__ import annotations
 import sys
 import tempfile
 import webbrowser
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
 
-from semcal_ros.cli.options import DURATION
+from semcal_ros.cli.options import needs_ros, options_of
 from semcal_ros.cli.output import show_progress
 from semcal_ros.cli.view_command import require_view
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.workflows.options import Option
 
 # Views of the grid for the calibration: some seconds of work, good to a few tenths of a per cent.
 _MAGNIFICATIONS = (1500.0, 2200.0, 3200.0, 4700.0, 6800.0, 9000.0)
 _VIEWS, _VIEW_SIZE = 4, 320
 
 
+@dataclass(frozen=True)
+class DemoOptions:
+    """Where and how the virtual microscope is shown."""
+
+    port: Annotated[int, Option("Port of the page; 0 takes a free one.", between=(0, 65535))] = 8060
+    size: Annotated[int, Option("Width and height of the images, px.", between=(64, 4096))] = 512
+    duration_s: Annotated[
+        float | None, Option("End by itself after this time, such as 60s.", kind="time")
+    ] = None
+    browser: Annotated[bool, Option("Also open the page in the browser of this computer.")] = False
+
+
 @click.command("demo")
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8060,
-    show_default=True,
-    help="Port of the page; 0 takes a free one.",
-)
-@click.option(
-    "--size",
-    type=click.IntRange(64, 4096),
-    default=512,
-    show_default=True,
-    help="Width and height of the images, px.",
-)
-@click.option("--duration", type=DURATION, help="End by itself after this time, such as 60s.")
-@click.option("--browser", is_flag=True, help="Also open the page in the browser of this computer.")
-def command(port: int, size: int, duration: float | None, browser: bool) -> None:
+@options_of(DemoOptions)
+def command(options: DemoOptions) -> None:
     """Show a virtual microscope in the browser, raw and corrected: no instrument, no files.
 
     It calibrates the virtual microscope from simulated pictures of the grid, starts virtual_sem, parameter_server and
@@ -61,14 +60,8 @@ def command(port: int, size: int, duration: float | None, browser: bool) -> None
       semcal demo
     """
     require_view()
-    try:
+    with needs_ros():
         from semcal_ros.nodes.demo import run_demo
-    except ImportError as error:
-        raise SemcalError(
-            f"ROS 2 cannot be imported ({error})",
-            expected="rclpy",
-            do="source a ROS 2 workspace or run `make setup`",
-        ) from error
     from semcal_ros.workflows.calibrate import CalibrateOptions, calibrate_recording
     from semcal_ros.workflows.simulate import simulate
 
@@ -89,8 +82,14 @@ def command(port: int, size: int, duration: float | None, browser: bool) -> None
 
         def say(address: str, about: str) -> None:
             click.echo(f"open {address} ({about})")
-            if browser:
+            if options.browser:
                 webbrowser.open(address)
 
-        status = run_demo(file, port=port, size=size, duration_s=duration or 0.0, say=say)
+        status = run_demo(
+            file,
+            port=options.port,
+            size=options.size,
+            duration_s=options.duration_s or 0.0,
+            say=say,
+        )
     sys.exit(status)

@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 import re
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, dataclass
 from functools import wraps
 from pathlib import Path
@@ -27,7 +28,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 
 import click
 
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.files.images.metadata import angle_in_degrees, plain_number, quantity
 from semcal_ros.workflows.options import (
     OVERWRITE,
@@ -173,6 +174,30 @@ def parse_ratio(
     if ratio is None:
         raise click.BadParameter(f"{text!r} is not a ratio such as 0.1% or 0.001")
     return float(f"{0.01 * ratio:.12g}") if text.strip().endswith("%") else ratio
+
+
+@contextmanager
+def needs_ros(expected: str = "rclpy") -> Iterator[None]:
+    """Refuse, where ROS 2 cannot be imported, what imports it inside.
+
+    Parameters
+    ----------
+    expected
+        What the command needs.
+
+    Raises
+    ------
+    SemcalError
+        If an import inside fails.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise SemcalError(
+            f"ROS 2 cannot be imported ({error})",
+            expected=expected,
+            do="source a ROS 2 workspace or run `make setup`",
+        ) from error
 
 
 def require_folder(path: Path) -> None:
@@ -404,6 +429,7 @@ KINDS: dict[str, Kind] = {
     "length": Kind("LENGTH", LENGTH, write=_write_length),
     "length or 0": Kind("LENGTH", LENGTH_OR_ZERO, write=_write_length),
     "height": Kind("LENGTH", HEIGHT),
+    "time": Kind("TIME", DURATION),
     "time to listen": Kind(
         "TIME",
         Quantity("time", "s", "3s or 500ms", within=(0.1, 3600.0)),

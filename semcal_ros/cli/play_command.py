@@ -24,8 +24,7 @@ from typing import Annotated
 
 import click
 
-from semcal_ros.cli.options import config_option, options_of
-from semcal_ros.core.errors import SemcalError
+from semcal_ros.cli.options import config_option, needs_ros, options_of
 from semcal_ros.workflows.options import Option
 
 
@@ -67,14 +66,8 @@ def command(recording: Path, options: PlayOptions, config: str) -> None:
       semcal play recordings/session --topics all --exclude calibration
     """
     _require_bag(recording)
-    try:
+    with needs_ros():
         from semcal_ros.nodes.bag_player import main as play
-    except ImportError as error:
-        raise SemcalError(
-            f"ROS 2 cannot be imported ({error})",
-            expected="rclpy",
-            do="source a ROS 2 workspace or run `make setup`",
-        ) from error
     parameters: dict[str, bool | int | float | str] = {
         "bag": str(recording.absolute()),
         "rate": options.rate,

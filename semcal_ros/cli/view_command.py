@@ -27,7 +27,7 @@ from typing import Annotated, Any
 
 import click
 
-from semcal_ros.cli.options import options_of
+from semcal_ros.cli.options import needs_ros, options_of
 from semcal_ros.cli.recording_input import optional_recording_input
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.errors import InvalidValueError, SemcalError
@@ -93,14 +93,8 @@ def command(
     if recording is not None:
         _show_recording(recording, config, calibration, options.drift, host, port, token)
         return
-    try:
+    with needs_ros("rclpy for a live stream, or a RECORDING"):
         from semcal_ros.nodes.viewer import run_viewer
-    except ImportError as error:
-        raise SemcalError(
-            f"ROS 2 cannot be imported ({error})",
-            expected="rclpy for a live stream, or a RECORDING",
-            do="source a ROS 2 workspace or run `make setup`",
-        ) from error
     if not options.drift:
         raise InvalidValueError("--no-drift for a live stream", expected="a RECORDING with it")
     if not options.namespace.startswith("/"):

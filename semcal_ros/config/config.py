@@ -17,7 +17,6 @@
 The classes below are the one declaration of such a file: its keys, defaults and limits. pydantic
 checks a file against them, and the ``description`` of a field is what an error names as expected.
 ``msg_configs/generic.yaml`` and ``doc/msg_configs.md`` explain every key; tests compare them.
-
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@
 """A folder into which the microscope's own software saves: each finished file is a frame, with what it says of itself.
 
 Which files have been published is kept over the end of the process, in a journal.
-
 """
 
 from __future__ import annotations

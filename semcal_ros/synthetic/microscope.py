@@ -17,7 +17,6 @@
 Its parameters change with the magnification by laws. None of them is a polynomial in g or in log g: a calibration that
 fits such polynomials meets a curve that it can only approximate, as with a real microscope, so that a test against it
 is meaningful.
-
 """
 
 from __future__ import annotations

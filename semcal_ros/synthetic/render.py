@@ -19,7 +19,6 @@ of samples by a quintic spline. The specimen plane and the drift are met exactly
 the nodes along it; a second spline gives the samples in between, at the cost of one matrix product
 per coordinate. The splines are wrong by less than 1e-8 px where the camera model is the whole
 truth, and by 0.002 px where a preset lets the beam settle within 20 px.
-
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@
 It shares neither priors nor equations with the calibration: the specimen is a rigid body that is
 turned about axes in space, and its points are projected by the true camera. So it serves to test the
 stated uncertainty. A stage that is driven does not do quite what it is told: wrong gain, tilted axes, and backlash.
-
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -43,6 +44,7 @@ from semcal_ros.workflows.inputs import (
     require_calibration,
     resolve_config,
 )
+from semcal_ros.workflows.options import CONFIG, PROGRESS, KeywordsOf, Option
 
 #: Relative 1-sigma of the length of a move along either axis of a stage, and of the right angle between them, where
 #: nothing else is stated. Screws without an encoder are a few tenths of a per cent off over short moves.
@@ -154,13 +156,25 @@ class SpecimenCheck:
         )
 
 
+@dataclass(frozen=True)
+class SpecimenCheckOptions:
+    """What is known of the recording of a specimen."""
+
+    stage_accuracy: Annotated[
+        float,
+        Option(
+            "With --specimen: relative 1-sigma of a move of the stage along either of its axes.",
+            kind="ratio",
+            python="And of the angle between these.",
+        ),
+    ] = STAGE_ACCURACY
+    config: Annotated[ConfigSource | None, CONFIG] = None
+    on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
+
+
+@KeywordsOf(SpecimenCheckOptions)
 def check_specimen(
-    calibration: CalibrationSource,
-    source: Source,
-    *,
-    config: ConfigSource | None = None,
-    stage_accuracy: float = STAGE_ACCURACY,
-    on_progress: OnProgress = ignore_progress,
+    calibration: CalibrationSource, source: Source, options: SpecimenCheckOptions
 ) -> SpecimenCheck:
     """Compare images of one place at two or more magnifications with what a calibration says of their scales.
 
@@ -178,25 +192,19 @@ def check_specimen(
     source
         A recording, or (image, magnification) tuples; the first frame of each magnification is used. The specimen
         must have texture, and stay where it is, untilted.
-    config
-        A ``msg_configs`` name or file; the default is ``generic``.
-    stage_accuracy
-        Relative 1-sigma of a move of the stage along either of its axes, and of the angle between these.
-    on_progress
-        Called with the stage, the number of frames done, and that of all frames.
 
     Raises
     ------
     BagError
         If there are fewer than two magnifications and no moves of the stage, or no two of them can be compared.
     """
-    check_positive(stage_accuracy, "stage_accuracy =")
+    check_positive(options.stage_accuracy, "stage_accuracy =")
     model = require_calibration(calibration)
-    chosen = resolve_config(config, model)
+    chosen = resolve_config(options.config, model)
     images: dict[float, Array32] = {}
     moves: dict[float, _Moves] = {}
     with open_source(source, chosen) as recording:
-        advance = count_frames(on_progress, "reading", recording.frame_count)
+        advance = count_frames(options.on_progress, "reading", recording.frame_count)
         for frame in recording.frames():
             if frame.magnification not in images:
                 grey = to_gray(frame.visible, frame.encoding)
@@ -206,7 +214,9 @@ def check_specimen(
             advance(1)
         notes = recording.notes
     moved = tuple(
-        check for g in sorted(moves) if (check := moves[g].judge(g, stage_accuracy)) is not None
+        check
+        for g in sorted(moves)
+        if (check := moves[g].judge(g, options.stage_accuracy)) is not None
     )
     if len(images) < 2 and moved:
         return SpecimenCheck((), notes, moved)
@@ -217,7 +227,7 @@ def check_specimen(
             do="set another magnification without moving the stage, or record its x and y while it moves",
         )
     ordered = sorted(images)
-    on_progress("comparing", 0, None)
+    options.on_progress("comparing", 0, None)
     ratios = tuple(
         _compare(model, (low, images[low]), (high, images[high]))
         for low, high in itertools.pairwise(ordered)

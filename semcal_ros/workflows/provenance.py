@@ -14,7 +14,6 @@
 
 """Where a calibration comes from: its recording, configuration and conditions; and whether another recording was taken
 under the same conditions.
-
 """
 
 from __future__ import annotations

@@ -21,7 +21,11 @@ specimen is a ball.
 
 from __future__ import annotations
 
-from semcal_ros.applications.reconstruction.adjustment import AdjustedStructure, adjust
+from semcal_ros.applications.reconstruction.adjustment import (
+    AdjustedStructure,
+    Observations,
+    adjust,
+)
 from semcal_ros.applications.reconstruction.ball import (
     Ball,
     Roundness,
@@ -32,6 +36,7 @@ from semcal_ros.applications.reconstruction.ball import (
 from semcal_ros.applications.reconstruction.factorization import (
     AffineStructure,
     MetricUpgrade,
+    Tracks,
     factorize,
     mirror_structure,
     upgrade_to_metric,
@@ -47,7 +52,6 @@ from semcal_ros.applications.reconstruction.reconstruct import (
     reconstruct,
 )
 from semcal_ros.applications.reconstruction.surface import SurfaceMesh, triangulate_cloud
-from semcal_ros.applications.reconstruction.types import Observations, Tracks
 
 __all__ = [
     "AdjustedStructure",

@@ -29,14 +29,59 @@ from functools import partial
 
 import numpy as np
 
+from semcal_ros.applications.reconstruction.factorization import Tracks
 from semcal_ros.applications.reconstruction.thresholds import CAUCHY_SIGMAS, DEPTH_PRIOR, SCALE_MIN
-from semcal_ros.applications.reconstruction.types import Observations, tabulate_cameras
-from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, invert_scaled, solve_scaled
+from semcal_ros.core.arrays import MEDIAN_CHI2_2, Array, Indices, Mask, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, Step, descend
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.robust_losses import cauchy_loss, cauchy_weight
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Observations of points in views as a list, in undistorted pixels, with their weights.
+
+    Parameters
+    ----------
+    view, point
+        (n,) indices.
+    xy
+        (n, 2) undistorted px.
+    root
+        (n, 2, 2) root of the information matrix: ``root @ error`` has unit covariance, 1/px.
+    """
+
+    view: Indices
+    point: Indices
+    xy: Array
+    root: Array
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def select(self, keep: Mask | Indices) -> Observations:
+        """Select some of the observations."""
+        return Observations(self.view[keep], self.point[keep], self.xy[keep], self.root[keep])
+
+    @staticmethod
+    def from_tracks(
+        tracks: Tracks, cameras: Sequence[ScanCamera], sigma_px: float = 1.0
+    ) -> Observations:
+        """Convert all that is seen in tracks, with one standard deviation."""
+        view, point = np.nonzero(tracks.seen)
+        table = tabulate_cameras(cameras)[view]
+        x, y = tracks.xy_m[view, point].T
+        m, a, skew, px, py = table[:, :5].T
+        xy = np.stack([px + m * (a * x + skew * y), py + m * y / a], axis=1)
+        root = np.broadcast_to(np.eye(2) / sigma_px, (len(view), 2, 2))
+        return Observations(view, point, xy, np.array(root))
+
+
+def tabulate_cameras(cameras: Sequence[ScanCamera]) -> Array:
+    """Tabulate (views, 6) m, aspect, skew, px, py, rho."""
+    return np.array([camera.parameters[:6] for camera in cameras]).reshape(-1, 6)
 
 
 @dataclass(frozen=True, eq=False)

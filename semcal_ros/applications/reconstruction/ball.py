@@ -29,7 +29,6 @@ Two smooth departures from the sphere are looked for. An *ellipsoid* leaves a qu
 degree 2. A *bump* or a dent leaves a mean that is not zero in a window. Each is divided by its own covariance, in which
 the errors of the poses matter most: an error of the turns stretches all depths alike, which looks like an
 ellipsoid. What the points scatter beyond their own uncertainty is added.
-
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.special import chdtrc, chdtri, ndtr, stdtrit
 
-from semcal_ros.applications.reconstruction.adjustment import adjust
+from semcal_ros.applications.reconstruction.adjustment import Observations, adjust
 from semcal_ros.applications.reconstruction.reconstruct import Structure
 from semcal_ros.applications.reconstruction.surface import (
     SurfaceMesh,
@@ -63,7 +62,6 @@ from semcal_ros.applications.reconstruction.thresholds import (
     SPHERE_POINTS_MIN,
     SPHERE_TRIALS,
 )
-from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
 from semcal_ros.core.errors import StructureError
 from semcal_ros.core.robust_losses import huber_weight, tukey_weight

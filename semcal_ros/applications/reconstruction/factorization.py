@@ -29,7 +29,6 @@ parallel projection, whatever the number of views:
   :attr:`MetricUpgrade.condition`;
 - the *mirror image* in depth, with mirrored rotations, explains the tracks exactly as well:
   :func:`mirror_structure`.
-
 """
 
 from __future__ import annotations
@@ -47,9 +46,8 @@ from semcal_ros.applications.reconstruction.thresholds import (
     VIEW_POINTS_MIN,
     WINDOWS,
 )
-from semcal_ros.applications.reconstruction.types import Tracks
 from semcal_ros.core.arrays import Array, Indices, Mask, mad_sigma
-from semcal_ros.core.errors import StructureError
+from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.core.robust_losses import huber_weight
 from semcal_ros.core.wording import counted
 
@@ -57,6 +55,34 @@ from semcal_ros.core.wording import counted
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 # Rows and columns of the six different entries of Q.
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Positions of points in the views, in the plane of the specimen.
+
+    Parameters
+    ----------
+    xy_m
+        (views, points, 2) sem-frame X and Y at height 0 of the line of sight, m
+        (:meth:`~semcal_ros.core.camera.scan_camera.ScanCamera.sem_from_ideal` of undistorted
+        pixels). The calibrated intrinsics are divided out, so that every view is a parallel
+        projection in true scale, up to ``1 / (1 + rho Z)``. Arbitrary where not seen.
+    seen
+        (views, points) whether each view sees each point.
+    """
+
+    xy_m: Array
+    seen: Mask
+
+    def __post_init__(self) -> None:
+        if self.xy_m.ndim != 3 or self.xy_m.shape != (*self.seen.shape, 2):
+            raise InvalidValueError(
+                f"tracks of shape {self.xy_m.shape} with a mask of shape {self.seen.shape}",
+                expected="(views, points, 2) and (views, points)",
+            )
+        if not np.all(np.isfinite(self.xy_m[self.seen])):
+            raise InvalidValueError("tracks that are not finite", expected="finite metres")
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from semcal_ros.applications.reconstruction.adjustment import Observations
 from semcal_ros.applications.reconstruction.appearance import Shading, fit_shading
 from semcal_ros.applications.reconstruction.feature_tracks import TrackKeyframe, project_to_plane
 from semcal_ros.applications.reconstruction.thresholds import (
@@ -39,7 +40,6 @@ from semcal_ros.applications.reconstruction.thresholds import (
     SHADING_POINTS,
     WINDOW,
 )
-from semcal_ros.applications.reconstruction.types import Observations
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_timing import ScanTiming
 

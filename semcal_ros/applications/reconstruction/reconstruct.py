@@ -24,9 +24,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from semcal_ros.applications.reconstruction.adjustment import AdjustedStructure, adjust
+from semcal_ros.applications.reconstruction.adjustment import (
+    AdjustedStructure,
+    Observations,
+    adjust,
+)
 from semcal_ros.applications.reconstruction.appearance import compute_log_grey
 from semcal_ros.applications.reconstruction.factorization import (
+    Tracks,
     factorize,
     mirror_structure,
     upgrade_to_metric,
@@ -41,7 +46,6 @@ from semcal_ros.applications.reconstruction.patches import (
 )
 from semcal_ros.applications.reconstruction.surface import compute_spacing_m, fit_local_surface
 from semcal_ros.applications.reconstruction.thresholds import POINT_MISFIT_MAX, WINDOW
-from semcal_ros.applications.reconstruction.types import Observations, Tracks
 from semcal_ros.core.arrays import Array, Image, Indices, Mask
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming

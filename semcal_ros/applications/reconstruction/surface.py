@@ -21,7 +21,6 @@ onto the quadric. Normals and curvature are those of the quadric.
 For the mesh of a round surface, directions from a point inside are triangulated on the unit sphere: the convex hull of
 the directions is their Delaunay triangulation. Triangles much larger than the typical spacing span
 areas that no view showed; they are left out, so the mesh has holes where there are no data.
-
 """
 
 from __future__ import annotations

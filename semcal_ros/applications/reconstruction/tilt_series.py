@@ -22,7 +22,6 @@ does not follow from two pictures.
 
 A pair with the relative tilt ``t`` has the disparity ``d = h tan t`` in the picture of the reference, up to a constant,
 since nobody knows how far the specimen moved. So heights are known up to a constant, and are given about their median.
-
 """
 
 from __future__ import annotations

@@ -19,7 +19,6 @@ the image when the magnification changes. A calibration on tilted grids determin
 perspective alone, to some px. A target at rest while the magnification changes determines it to a
 fraction of a px: seen through cameras whose principal points are both wrong by d px, the target
 lies at ``X + d / m1``, then at ``X + d / m2``.
-
 """
 
 from __future__ import annotations

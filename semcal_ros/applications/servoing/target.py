@@ -27,7 +27,6 @@ half-width h makes the mean ``(black (h + delta) + white (h - delta)) / 2h``. Bl
 since it is the same to both sides. A line through the steps of a side is known to a few hundredths
 of a pixel, and so are the corners, where two lines meet: the corner of a blurred image itself is
 rounded, and a corner detector finds it further inside.
-
 """
 
 from __future__ import annotations

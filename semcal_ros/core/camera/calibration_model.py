@@ -16,7 +16,6 @@
 
 A nominal calibration is what a microscopist has who knows nm per pixel at some magnifications, from the maker or from a
 scale bar: no distortion, a parallel projection, and the uncertainty of both.
-
 """
 
 from __future__ import annotations

@@ -20,7 +20,6 @@ OpenCV, ROS, mrcal and COLMAP share one model: ``x = X / Z``, ``y = Y / Z`` in t
 3D Reconstruction"). It holds a microscope only in part: it has no skew and no residual field, its distortion is
 centred on the principal point, and it has no parallel projection. What cannot be held is stated in px. ROS calls the
 model with five coefficients ``plumb_bob``.
-
 """
 
 from __future__ import annotations

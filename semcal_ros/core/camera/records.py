@@ -16,7 +16,6 @@
 
 The statistics of a calibration are notes for people, which may be edited. What programs read back is here, with types
 and units, and is checked when a file is read.
-
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ covariance predicts over the field.
 
 The parts are independent and add as variances (JCGM 100:2008, "GUM", 5.1.2); the expanded uncertainty has the coverage
 factor 2, which is 95 % for a normal distribution (6.2.1).
-
 """
 
 from __future__ import annotations

@@ -25,7 +25,6 @@ exactly and slowly. In the table of a field, ``e(u)``, raw minus undisplaced pos
 shrinks by the slope of the field, some hundredths, in each. The table is interpolated linearly at positions that OpenCV
 rounds to 1/32 of its step, so that ``e`` is wrong by up to 1/64 of its change from step to step. Whoever uses a table
 checks what comes out.
-
 """
 
 from __future__ import annotations

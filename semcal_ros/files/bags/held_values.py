@@ -17,7 +17,6 @@
 A recording can always be calibrated without its stage. So nothing that is wrong with it is an error:
 it is left out, in whole or in part, with a note that says why. Conditions are never an error either: what cannot be
 read is not known.
-
 """
 
 from __future__ import annotations

@@ -20,7 +20,6 @@ single file. What the bag library and its backends raise on damaged or foreign f
 ``AnyReader`` of rosbags would choose the message types too. But it registers the definitions of all
 topics when it opens a recording, so that a damaged definition on an unused topic would make the
 recording unreadable, and it generates code for arrays of any fixed length before they can be refused.
-
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@
 
 The bags of this package: corrected frames, one message of each kind per frame; simulated frames, with their ground
 truth beside them; and pictures of the grid as they are taken, which `semcal calibrate` reads.
-
 """
 
 from __future__ import annotations

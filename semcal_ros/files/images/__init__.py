@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Recordings, vendor images and files on disk."""
+"""Images on disk: files of any kind, series of them, and what they say of themselves; data bars, masks, scale bars."""

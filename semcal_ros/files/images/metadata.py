@@ -15,7 +15,6 @@
 """Metadata as text: numbers with units, dates, XML, and the files next to an image in which some makers keep them.
 
 The XML stands in a tag that the microscopes of Thermo Fisher and Phenom share.
-
 """
 
 from __future__ import annotations

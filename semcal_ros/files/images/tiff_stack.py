@@ -15,7 +15,6 @@
 """TIFF files without a microscope's metadata: plain, OME-TIFF, stacks of ImageJ and of this package; OME-TIFF written.
 
 Written are images of any depth with their pixel size and times, page by page.
-
 """
 
 from __future__ import annotations

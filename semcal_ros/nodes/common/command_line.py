@@ -15,7 +15,6 @@
 """What a node was started with: refuses what it would otherwise ignore, reads parameter files, and prints `--help`.
 
 The table of executables is the one at the top of ``doc/nodes.md``.
-
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@
 """The publishers, subscriptions and services of a node, created alike and monitored together.
 
 A short want of room in the middleware does not end a publisher, and it knows who waits for messages.
-
 """
 
 from __future__ import annotations

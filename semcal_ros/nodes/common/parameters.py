@@ -15,7 +15,6 @@
 """Parameters of a node: declared once with description, unit and range, refused with a reason, applied live.
 
 Files that are named while a node runs, such as by a service, lie in one folder.
-
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@
 """A subscription that requests a lower quality of service when a publisher does not offer the requested one.
 
 It can watch whether its topic has one source, and whether that sends.
-
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@
 They are: the calibrated magnifications; the figures of the paper, Malti et al. (2012),
 doi:10.1117/1.JEI.21.3.033020, next to those of the calibration; and the camera with its scale, distortion and
 uncertainty at each step of a slider over the magnification.
-
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@
 
 The views that fit worst are shown with their residuals and what these look like; the last is shown in turn at the same
 place.
-
 """
 
 from __future__ import annotations

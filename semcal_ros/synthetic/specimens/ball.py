@@ -20,7 +20,6 @@ other semi-axes or a bump; the texture has one of several statistics, so that no
 Every sample of a frame is a ray of the true camera, distortion included, that meets the ball or the tip where they are
 when its line is scanned. The yield grows with the slope as that of secondary electrons does, so the limb is bright and
 the shading stays while the texture turns with the ball.
-
 """
 
 from __future__ import annotations

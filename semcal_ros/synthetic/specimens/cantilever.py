@@ -18,7 +18,6 @@ A beam leaves a holder and ends over a textured background. A plane comes from o
 end and is drawn back, while the specimen as a whole drifts. Coordinates of the scene: the base is
 the origin, the beam at rest lies along +x, and the pusher moves it towards +y, or towards -y if it
 comes from there. Beams, substrates and pushes of many looks can be drawn at random, so that nothing is tuned to one.
-
 """
 
 from __future__ import annotations

@@ -27,9 +27,8 @@ from semcal_ros.applications.reconstruction import (
     measure_ball,
     reconstruct,
 )
-from semcal_ros.applications.reconstruction.adjustment import adjust
+from semcal_ros.applications.reconstruction.adjustment import adjust, tabulate_cameras
 from semcal_ros.applications.reconstruction.ball import jackknife_sigma, split_neighbours
-from semcal_ros.applications.reconstruction.types import tabulate_cameras
 from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan, draw_ball_plan

@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where the stage was at each frame of a recording, and what wrong stages get: a note, never an error."""
+"""Where the stage was, and under which conditions, at each frame of a recording; what is wrong is a note, no error."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,18 +26,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.config.config import MicroscopeConfig, StageConfig
+from semcal_ros.bridge.conditions import CONDITIONS_TYPE, Conditions, fill_conditions
+from semcal_ros.config.config import MicroscopeConfig, StageConfig, load_config
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
-from semcal_ros.files.recordings import RecordedFrame, open_recording
+from semcal_ros.files.recordings import RecordedFiles, RecordedFrame, open_recording
+from semcal_ros.workflows.provenance import describe_provenance
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
 CONFIG = MicroscopeConfig(name="test", display_width_m=0.12)
 
 Timed = tuple[str, int, Any]
+
+GENERIC = load_config("generic")
+FIRST_NS = 1_700_000_000 * 10**9
+SECOND_NS = 10**9
 
 
 def joints(positions: Mapping[str, float], stamp_ns: int = 0) -> Any:
@@ -278,3 +285,101 @@ def test_a_stage_that_moves_during_a_frame_tells_nothing_about_it(tmp_path: Path
     )
     assert tilts(frames) == [None, 0.2]
     assert notes == "the stage moved during 1 image: its readings are not used there"
+
+
+def pairs(**values: str) -> Any:
+    """A message with these texts, whatever they are."""
+    message = blank_message(CONDITIONS_TYPE)
+    message.values = []
+    for key, value in values.items():
+        pair = blank_message("diagnostic_msgs/msg/KeyValue")
+        pair.key, pair.value = key, value
+        message.values.append(pair)
+    return message
+
+
+def write(path: Path, told: dict[int, tuple[str, Any]], frames: int = 3) -> Path:
+    """A recording of one frame per second; ``told`` goes out half a second before the frame of its number."""
+    with BagWriter(path) as writer:
+        for index in range(frames):
+            stamp_ns = FIRST_NS + index * SECOND_NS
+            if index in told:
+                topic, message = told[index]
+                writer.write(topic, stamp_ns - SECOND_NS // 2, message)
+            number = blank_message("std_msgs/msg/Float64")
+            number.data = 1000.0
+            writer.write("/sem/magnification", stamp_ns - 1000, number)
+            image = blank_message("sensor_msgs/msg/Image")
+            image.header.stamp.sec = stamp_ns // SECOND_NS
+            image.height, image.width, image.step, image.encoding = 4, 4, 4, "mono8"
+            image.data = np.zeros(16, np.uint8)
+            writer.write("/sem/image_raw", stamp_ns, image)
+    return path
+
+
+def conditions_of(path: Path) -> list[Conditions | None]:
+    with open_recording(RecordedFiles(path), GENERIC) as recording:
+        return [frame.conditions for frame in recording.frames()]
+
+
+def test_a_message_holds_until_the_next_one_and_reaches_the_provenance(tmp_path: Path) -> None:
+    known = blank_message(CONDITIONS_TYPE)
+    fill_conditions(known, {"accelerating_voltage_v": 5e3, "beam_current_a": 1e-10, "serial": "7"})
+    path = write(
+        tmp_path / "bag",
+        {
+            0: ("/sem/conditions", known),
+            2: ("/sem/conditions", pairs(accelerating_voltage_v="10000")),
+        },
+    )
+    first = Conditions(acceleration_voltage_v=5e3, beam_current_a=1e-10, serial_number="7")
+    found = conditions_of(path)
+    assert found == [first, first, Conditions(acceleration_voltage_v=1e4)]
+    with open_recording(RecordedFiles(path), GENERIC) as recording:
+        views = {str(k): frame for k, frame in enumerate(recording.frames())}
+    origin = describe_provenance(path, GENERIC, views)
+    assert origin.conditions == {
+        "acceleration_voltage_v": (5e3, 1e4),
+        "beam_current_a": (1e-10, 1e-10),
+        "serial_number": ("7",),
+    }
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        pairs(),
+        pairs(accelerating_voltage_v="5 kV", working_distance_m="nan", dwell_s=""),
+        pairs(voltage="5000"),
+    ],
+)
+def test_what_is_no_number_is_not_known(message: Any, tmp_path: Path) -> None:
+    assert conditions_of(write(tmp_path / "bag", {0: ("/sem/conditions", message)})) == [None] * 3
+
+
+def test_of_several_microscopes_the_one_of_the_images_counts(tmp_path: Path) -> None:
+    told = {
+        0: ("/sem/conditions", pairs(serial="own")),
+        1: ("/other/conditions", pairs(serial="other")),
+    }
+    serials = [c.serial_number for c in conditions_of(write(tmp_path / "bag", told)) if c]
+    assert serials == ["own"] * 3
+
+
+@pytest.mark.parametrize(
+    ("text", "serial"),
+    [
+        (json.dumps({"stamp_ns": FIRST_NS, "serial_number": "7", "dwell_s": "fast"}), "7"),
+        (json.dumps({"stamp_ns": FIRST_NS + 1, "serial_number": "7"}), ""),
+        ("[" * 5000, ""),
+        ("{", ""),
+        ("null", ""),
+    ],
+)
+def test_an_imports_settings_count_for_their_own_image(
+    text: str, serial: str, tmp_path: Path
+) -> None:
+    message = blank_message("std_msgs/msg/String")
+    message.data = text
+    found = conditions_of(write(tmp_path / "bag", {0: ("/sem/metadata", message)}))
+    assert found == [Conditions(serial_number=serial) if serial else None, None, None]
