@@ -128,7 +128,7 @@ _FIRST_LOOKS, _LOOK_EVERY = 3, 8
 # each time, up to so many: a spot does not show where the specimen is as dark.
 _FIXED_FIRST, _FIXED_LATER = 4, 32
 # Part of the image that must newly be found to stay, for keyframes to be freed of it.
-_NEWLY_FIXED = 2e-4
+_NEWLY_FIXED = 1e-4
 # What moves by less than this against the specimen may not have been found, and has pulled by a part of it at most, px.
 _MOST_PULLED_PX = 0.3
 # Chi-square (2 degrees of freedom) from which a mean is of frames that were pulled: of others, one in a hundred, which
@@ -424,10 +424,12 @@ class DriftTracker:
             if found is not None:
                 known = np.zeros_like(found.stays) if fixed.mask is None else fixed.mask
                 fixed.mask = found.stays | (known & ~found.moves)
-                is_new = float(np.mean(found.stays & ~known)) > _NEWLY_FIXED
+                # What is drawn is left out already.
+                stays = found.stays if track.overlay is None else found.stays & ~track.overlay
+                is_new = float(np.mean(stays & ~known)) > _NEWLY_FIXED
                 if is_new:
                     # What stays pulls to where it is: by its part of the structure.
-                    pulled_px = share_of_gradients(pixels, found.stays) * moved_px
+                    pulled_px = share_of_gradients(pixels, stays) * moved_px
                     moved = np.linalg.solve(frame.px_from_unit, pulled_px)
                     track.filter.widen_measurements(np.outer(moved, moved))
                     self._clean_keyframes(track)
@@ -995,6 +997,8 @@ def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
         and not np.any(shows_shear)
         and float(np.max(shear_px)) < _MAX_BLUR_PX
         and float(np.max(np.diag(registration.covariance))) < _MAX_PLACE_PX**2
+        # A mean that is pulled stays so, and all that is registered against it.
+        and not alignment.may_be_pulled
     )
 
 

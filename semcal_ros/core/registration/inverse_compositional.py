@@ -183,6 +183,9 @@ class Alignment:
         Fraction of the smaller image that both show.
     converged, iterations
         Whether the last step left nothing that matters, and the number of steps.
+    may_be_pulled
+        Whether a part of the image that moves by itself, and was not found to, may pull the shift by more than its
+        1-sigma without that part (:meth:`with_pull`).
     """
 
     shift_px: Array
@@ -200,6 +203,7 @@ class Alignment:
     overlap: float
     converged: bool
     iterations: int
+    may_be_pulled: bool = False
     _comparison: _Comparison | None = field(default=None, repr=False, compare=False)
     _left: Array | None = field(default=None, repr=False, compare=False)
 
@@ -215,7 +219,10 @@ class Alignment:
         joint = self.joint_covariance.copy()
         joint[:2, :2] += np.outer(pull, pull)
         return replace(
-            self, covariance=self.covariance + np.outer(pull, pull), joint_covariance=joint
+            self,
+            covariance=self.covariance + np.outer(pull, pull),
+            joint_covariance=joint,
+            may_be_pulled=bool(np.any(pull**2 > np.diag(self.covariance))),
         )
 
     def fit_similarity(self) -> SimilarityFit | None:
