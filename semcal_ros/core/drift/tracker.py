@@ -425,7 +425,9 @@ class DriftTracker:
                 known = np.zeros_like(found.stays) if fixed.mask is None else fixed.mask
                 fixed.mask = found.stays | (known & ~found.moves)
                 # What is drawn is left out already.
-                stays = found.stays if track.overlay is None else found.stays & ~track.overlay
+                stays, drawn = found.stays, track.overlay
+                if drawn is not None and drawn.shape == stays.shape:
+                    stays = stays & ~drawn
                 is_new = float(np.mean(stays & ~known)) > _NEWLY_FIXED
                 if is_new:
                     # What stays pulls to where it is: by its part of the structure.
