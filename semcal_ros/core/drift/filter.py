@@ -47,6 +47,8 @@ _MIN_MOTION = 0.02
 _TIME_CONSTANT = 1.0
 # Numbers of measurements after which the process noise is estimated again from all of them.
 _ESTIMATE_AFTER = (4, 8, 16)
+# By how many deviations it is taken larger then: of so few measurements, too large an uncertainty is the lesser evil.
+_LARGER_SIGMAS = 1.0
 
 
 @dataclass
@@ -155,7 +157,9 @@ class DriftFilter:
             near = self.process_noise
             if interval_s > 0.0:
                 near = replace(near, time_constant_s=_TIME_CONSTANT * interval_s)
-            self.process_noise = estimate_process_noise(self.start, self.events, near, (1.0,))
+            self.process_noise = estimate_process_noise(
+                self.start, self.events, near, (1.0,), _LARGER_SIGMAS
+            )
             self.state = replay(self.start, self.events, self.process_noise)
 
     def widen_measurements(self, covariance: Array) -> None:
