@@ -19,7 +19,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semcal_ros.core.arrays import check_image, equilibrate, invert_scaled, mad_sigma, solve_scaled
+from semcal_ros.core.arrays import (
+    check_image,
+    equilibrate,
+    invert_scaled,
+    mad_sigma,
+    median,
+    quantile,
+    solve_scaled,
+)
 from semcal_ros.core.errors import InvalidValueError
 
 # Metres beside pixels beside radians.
@@ -84,6 +92,15 @@ def test_the_robust_sigma_is_that_of_the_majority() -> None:
     # A tenth of outliers on one side shifts the quantile that is used from 50 to 55.6 %.
     assert mad_sigma(values) == pytest.approx(2.0 * 0.765 / 0.6745, rel=0.02)
     assert mad_sigma(values[2000:]) == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 48])
+def test_medians_and_quantiles_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count)
+    assert median(values) == np.median(values)
+    for part in (0.0, 0.3, 0.5, 1.0):
+        # Both are the same two numbers, added up in another order.
+        assert quantile(values, part) == pytest.approx(np.quantile(values, part), abs=1e-14)
 
 
 def test_pictures_pass_as_they_are() -> None:

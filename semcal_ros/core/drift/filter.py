@@ -40,6 +40,7 @@ from semcal_ros.core.drift.thresholds import (
     ADAPTATION,
     ESTIMATED_AFTER,
     INNOVATION_RATIO_MAX,
+    LARGER_SIGMAS,
     MOTION_MIN,
     TIME_CONSTANT_FRAMES,
 )
@@ -213,7 +214,7 @@ class DriftFilter:
         near = self.process_noise
         if interval_s > 0.0:
             near = replace(near, time_constant_s=TIME_CONSTANT_FRAMES * interval_s)
-        process_noise = estimate_process_noise(self.start, events, near, (1.0,))
+        process_noise = estimate_process_noise(self.start, events, near, (1.0,), LARGER_SIGMAS)
         state = replay(self.start, events, process_noise)
         return replace(self, process_noise=process_noise, state=state)
 

@@ -192,4 +192,6 @@ def _is_mergeable(match: Match, store: KeyframeStore) -> bool:
         and not np.any(shows_shear)
         and float(np.max(shear_px)) < BLUR_PX_MAX
         and float(np.max(np.diag(registration.covariance))) < PLACE_SIGMA_PX_MAX**2
+        # A mean that is pulled stays so, and all that is registered against it.
+        and not alignment.may_be_pulled
     )

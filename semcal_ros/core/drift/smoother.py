@@ -31,7 +31,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 
 from semcal_ros.core.arrays import Array, invert_scaled
 from semcal_ros.core.drift.operations import Measure, Operation
@@ -166,8 +166,9 @@ def estimate_process_noise(
     events: Sequence[Event],
     near: ProcessNoise,
     time_constants: Sequence[float] = (0.0, 2.0, 8.0),
+    deviations: float = 0.0,
 ) -> ProcessNoise:
-    """The process noise that makes the measurements most likely.
+    """The process noise that makes the measurements most likely, or one that is larger by some deviations.
 
     Parameters
     ----------
@@ -178,6 +179,10 @@ def estimate_process_noise(
         whose time constant is that of a few frames.
     time_constants
         Multiples of that time constant to choose from; 0 is a white acceleration.
+    deviations
+        The density is the largest whose likelihood lies within so many standard deviations of the highest. A few
+        measurements are most likely with hardly any noise a good part of the time, and a filter that believes it
+        follows a bent path by a straight line, at too small a sigma.
 
     Raises
     ------
@@ -190,16 +195,22 @@ def estimate_process_noise(
     if sum(isinstance(event, Measure) for event in part) < LIKELIHOOD_MEASUREMENTS_MIN:
         return near
     candidates = [
-        _maximise_likelihood(start, part, near, factor * near.time_constant_s)
+        _maximise_likelihood(start, part, near, factor * near.time_constant_s, deviations)
         for factor in time_constants
     ]
     return min(candidates, key=lambda pair: pair[0])[1]
 
 
 def _maximise_likelihood(
-    start: DriftState, events: Sequence[Event], near: ProcessNoise, time_constant_s: float
+    start: DriftState,
+    events: Sequence[Event],
+    near: ProcessNoise,
+    time_constant_s: float,
+    deviations: float,
 ) -> tuple[float, ProcessNoise]:
-    """Minus twice the log likelihood of the best density, and the process noise with it."""
+    """Minus twice the log likelihood of the best density, and the process noise with it, or with one that is larger by
+    so many standard deviations.
+    """
 
     def with_density(log_psd: float) -> ProcessNoise:
         psd = near.psd * float(np.exp(log_psd))
@@ -220,4 +231,14 @@ def _maximise_likelihood(
     found = minimize_scalar(
         cost, bounds=bounds, method="bounded", options={"xatol": DENSITY_LOG_TOLERANCE}
     )
-    return float(found.fun), with_density(float(found.x))
+    likely = float(found.x)
+    if deviations > 0.0:
+        # Minus twice the log likelihood rises by one at one deviation.
+        still = float(found.fun) + deviations**2
+        highest = _LOG_RANGE[1]
+        if cost(highest) > still:
+            likely = float(brentq(lambda v: cost(v) - still, likely, highest, xtol=_LOG_TOLERANCE))
+        else:
+            # They tell no upper limit: the guess.
+            likely = max(likely, 0.0)
+    return float(found.fun), with_density(likely)

@@ -142,8 +142,12 @@ class StaticParts:
             if found is not None:
                 known = np.zeros_like(found.stays) if self.fixed is None else self.fixed
                 parts = replace(parts, fixed=found.stays | (known & ~found.moves))
-                if float(np.mean(found.stays & ~known)) > NEWLY_FIXED:
-                    pulled_px = share_of_gradients(image, found.stays) * moved_px
+                # What is drawn is left out already.
+                stays, drawn = found.stays, self.overlay
+                if drawn is not None and drawn.shape == stays.shape:
+                    stays = stays & ~drawn
+                if float(np.mean(stays & ~known)) > NEWLY_FIXED:
+                    pulled_px = share_of_gradients(image, stays) * moved_px
         elif self.fixed is not None and self.fixed.shape != image.shape[:2]:
             parts = replace(self, fixed=None)
         latest = EarlierFrame(image.copy(), drift_px, px_from_unit)

@@ -192,8 +192,8 @@ FIXED_EVERY_FRAMES_MAX = TABLE.cost(
     "After which what stays is looked for again at the latest.",
 )
 NEWLY_FIXED = TABLE.stated(
-    "NEWLY_FIXED", 2e-4, "of the image",
-    "That must newly be found to stay for keyframes to be freed of it, which makes their means start again: 50 of "
+    "NEWLY_FIXED", 1e-4, "of the image",
+    "That must newly be found to stay for keyframes to be freed of it, which makes their means start again: 25 of "
     "512 x 512 px.",
 )
 
@@ -597,6 +597,11 @@ TIME_CONSTANT_FRAMES = TABLE.stated(
 ESTIMATED_AFTER = TABLE.cost(
     "ESTIMATED_AFTER", (4, 8, 16), "measurements",
     "After which the process noise is estimated again from all of them.",
+)
+LARGER_SIGMAS = TABLE.stated(
+    "LARGER_SIGMAS", 1.0, "sigma",
+    "By which it is taken larger than the likeliest then: of so few measurements, too large an uncertainty is the "
+    "lesser evil.",
 )
 
 # Hindsight, in smoother.py

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.arrays import Array, Mask, median, quantile
 from semcal_ros.core.registration.fractional_delay import gradients
 from semcal_ros.core.registration.inverse_compositional import TileStatistics
 from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
@@ -151,7 +151,7 @@ def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: 
 
     A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
     """
-    energy = np.trace(gradient, axis1=-2, axis2=-1)
+    energy = gradient[..., 0, 0] + gradient[..., 1, 1]
     expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
     # Smoothed noise has fewer independent pixels.
     scatter = expected * np.sqrt(shared_pixels(sigma_px) / pixels)
@@ -174,9 +174,9 @@ def find_agreement(
     # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.
     # A tile of which little counts may leave anything.
     whole = count >= 0.5 * float(np.max(count))
-    least = float(np.quantile((raw / count)[whole], _BEST_TILES))
+    least = quantile((raw / count)[whole], _BEST_TILES)
     floor = gain**2 * noise.reference + noise.image
-    hidden = max(1.0, least / max(float(np.median(floor)), 1e-30))
+    hidden = max(1.0, least / max(median(floor), 1e-30))
     floor = hidden * floor
     structure = gain**2 * np.maximum(tiles.reference - count * hidden * noise.reference, 0.0)
     # Scatter of sums of products of smoothed noise.
@@ -194,17 +194,19 @@ def find_agreement(
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
     body = fill_bodies(keep_bodies(disagrees, _BODY_TILES))
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-    energy = weights * np.trace(tiles.gradient, axis1=-2, axis2=-1)
+    energy = weights * (tiles.gradient[..., 0, 0] + tiles.gradient[..., 1, 1])
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
     return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights)
 
 
 def keep_bodies(disagrees: Mask, least: int) -> Mask:
     """The tiles that lie together in bodies of at least so many; one alone is chance, or a particle that blinks."""
-    found = disagrees.astype(np.uint8)
+    if not np.any(disagrees):
+        return np.zeros_like(disagrees)
+    found = disagrees.view(np.uint8)
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(found, connectivity=8)
-    large = np.flatnonzero(statistics[:, cv2.CC_STAT_AREA] >= least)
-    return np.asarray(disagrees & np.isin(labels, large))
+    large = statistics[:, cv2.CC_STAT_AREA] >= least
+    return np.asarray(disagrees & large[labels])
 
 
 def _bound_gain(tiles: TileStatistics, noise: TileNoise, weights: Array) -> Array:
@@ -217,18 +219,20 @@ def _bound_gain(tiles: TileStatistics, noise: TileNoise, weights: Array) -> Arra
     ratios = ratios[ratios > _LEAST_GAIN]
     if len(ratios) < _LEAST_TELLING:
         return gain
-    middle = float(np.median(ratios))
+    middle = median(ratios)
     return np.clip(gain, middle / _GAIN_RANGE, middle * _GAIN_RANGE)
 
 
 def fill_bodies(found: Mask, gap: int = 3) -> Mask:
     """A mask (h, w) without holes: none between parts less than ``gap`` apart, and none that they enclose."""
+    if not np.any(found):
+        return np.zeros_like(found)
     # A body may come in over the edge: what it encloses with the edge is inside, too.
     rows, cols = found.shape
     edge = gap // 2 + 1
-    joined = cv2.morphologyEx(
-        np.pad(found.astype(np.uint8), edge), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8)
-    )
+    padded = np.zeros((rows + 2 * edge, cols + 2 * edge), dtype=np.uint8)
+    padded[edge : edge + rows, edge : edge + cols] = found
+    joined = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
     contours, _ = cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     drawn = cv2.drawContours(np.zeros_like(joined), contours, -1, 1, cv2.FILLED)
     return np.asarray(drawn[edge : edge + rows, edge : edge + cols] > 0)
@@ -264,30 +268,33 @@ def _moves(
     ):
         # Nearly always: no tile is off at all.
         return np.zeros((rows, cols), dtype=bool)
-    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij")
+    terms_of_tiles = _make_terms(rows, cols)
     found = np.zeros((rows, cols), dtype=bool)
     shifts, precisions = np.zeros((2, rows, cols)), np.zeros((2, rows, cols))
     for axis in (0, 1):
         known = telling[..., axis]
         if np.count_nonzero(known) < _LEAST_TELLING:
             continue
-        design = np.stack([np.ones_like(x), x, y], axis=-1)[known]
+        design = terms_of_tiles[known]
         value, sigma = own[..., axis][known], np.sqrt(variance[..., axis][known])
         fitted = np.ones(len(value), dtype=bool)
         if suspected is not None and np.count_nonzero(known & ~suspected) >= _LEAST_TELLING:
             fitted = ~suspected[known]
         # What the ground leaves of a line; a bright edge is surer of itself than all the ground.
         spread = np.hypot(sigma, _OWN_SHIFT_PX)
-        terms = np.array([np.median(value[fitted]), 0.0, 0.0])
+        terms, before = np.array([median(value[fitted]), 0.0, 0.0]), None
         for _ in range(3):
             left = np.abs(value - design @ terms)
-            good = fitted & (left <= 3.0 * max(float(np.median(left[fitted])), _OWN_SHIFT_PX))
+            good = fitted & (left <= 3.0 * max(median(left[fitted]), _OWN_SHIFT_PX))
+            if before is not None and np.array_equal(good, before):
+                break
+            before = good
             scaled = design * (good / spread**2)[:, None]
             inverse = np.linalg.inv(scaled.T @ design + _LEAST_PRECISION * np.eye(3))
             terms = inverse @ (scaled.T @ value)
         value = _without_rows(value - design @ terms, known)
         left = np.abs(value)
-        scatter = max(1.0, 1.4826 * float(np.median(left / sigma)))
+        scatter = max(1.0, 1.4826 * median(left / sigma))
         uncertain = scatter * np.sqrt(float(inverse[1, 1]))
         if abs(float(terms[1])) > _LARGEST_STRETCH_PX + _SIGMAS * uncertain:
             # What changes along a row is no drift: the specimen is strained or turned, and no part of it is a tool.
@@ -305,6 +312,13 @@ def _moves(
     if suspected is not None and is_suspected:
         found |= _still_move(suspected & counts, shifts, precisions)
     return found
+
+
+@lru_cache(maxsize=32)
+def _make_terms(rows: int, cols: int) -> Array:
+    """(rows, cols, 3) one, x and y of the tiles, from -1 to 1."""
+    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij")
+    return np.stack([np.ones_like(x), x, y], axis=-1)
 
 
 def _still_move(suspected: Mask, shifts: Array, precisions: Array) -> Mask:
@@ -336,11 +350,9 @@ def _without_rows(values: Array, known: Mask) -> Array:
     enough = counts >= _LEAST_TELLING // 2
     # The median of what is known of each row, which sorts to its front: a tenth of the time of numpy.nanmedian.
     ordered, middle = np.sort(grid[enough], axis=1), counts[enough] // 2
-    low, high = (
-        np.take_along_axis(ordered, at[:, None], axis=1)
-        for at in (middle - 1 + counts[enough] % 2, middle)
-    )
-    grid[enough] -= 0.5 * (low + high)
+    row = np.arange(len(ordered))
+    middles = 0.5 * (ordered[row, middle - 1 + counts[enough] % 2] + ordered[row, middle])
+    grid[enough] -= middles[:, None]
     return np.asarray(grid[known])
 
 

@@ -37,13 +37,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
 from scipy.special import stdtrit
 
-from semcal_ros.core.arrays import Array, equilibrate
+from semcal_ros.core.arrays import Array, equilibrate, median
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.noise_spectrum import shared_pixels
@@ -183,6 +183,9 @@ class Alignment:
         Fraction of the smaller image that both show.
     converged, iterations
         Whether the last step left nothing that matters, and the number of steps.
+    may_be_pulled
+        Whether a part of the image that moves by itself, and was not found to, may pull the shift by more than its
+        1-sigma without that part (:meth:`with_pull`).
     """
 
     shift_px: Array
@@ -200,6 +203,7 @@ class Alignment:
     overlap: float
     converged: bool
     iterations: int
+    may_be_pulled: bool = False
     _comparison: _Comparison | None = field(default=None, repr=False, compare=False)
     _left: Array | None = field(default=None, repr=False, compare=False)
 
@@ -215,7 +219,10 @@ class Alignment:
         joint = self.joint_covariance.copy()
         joint[:2, :2] += np.outer(pull, pull)
         return replace(
-            self, covariance=self.covariance + np.outer(pull, pull), joint_covariance=joint
+            self,
+            covariance=self.covariance + np.outer(pull, pull),
+            joint_covariance=joint,
+            may_be_pulled=bool(np.any(pull**2 > np.diag(self.covariance))),
         )
 
     def fit_similarity(self) -> SimilarityFit | None:
@@ -226,7 +233,7 @@ class Alignment:
     def tile_statistics(self) -> TileStatistics | None:
         """What each tile shows at the shift; None where nothing was compared."""
         comparison = self._comparison
-        return None if comparison is None else _measure_tiles(comparison)
+        return None if comparison is None else comparison.tiles
 
     def row_power(self, modes: int) -> Array | None:
         """(2, k, 2) power of the shifts of the rows of tiles about a straight line, px^2 per row, in the
@@ -271,11 +278,6 @@ class TileStatistics:
     scores: Array
 
 
-def _measure_tiles(comparison: _Comparison) -> TileStatistics:
-    gain = comparison.geometry.ramps @ comparison.fit.gain
-    return _make_statistics(comparison.level, comparison.window, comparison.plain, gain)
-
-
 def _make_statistics(
     level: PyramidLevel, window: TileWindow, sums: TileSums, gain: Array
 ) -> TileStatistics:
@@ -309,11 +311,11 @@ def _look_at_tiles(level: PyramidLevel, image: Pyramid, shift: Array) -> TileSta
         return None
     sums = tile_sums(level, window, pixels, shift, np.zeros((2, 2)))
     tiles = _make_statistics(level, window, sums, np.ones(len(window.y) * len(window.x)))
-    rich = tiles.reference >= np.median(tiles.reference)
+    rich = tiles.reference >= median(tiles.reference)
     ratios = tiles.common[rich] / np.maximum(tiles.reference[rich], 1e-30)
     # What came in has nothing in common with what it covers.
     ratios = ratios[ratios > _LEAST_GAIN]
-    gains = np.full(tiles.gain.size, float(np.median(ratios)) if len(ratios) else 1.0)
+    gains = np.full(tiles.gain.size, median(ratios) if len(ratios) else 1.0)
     return _make_statistics(level, window, sums, gains)
 
 
@@ -357,6 +359,17 @@ class _Comparison:
     image_size: tuple[int, int]
     mean: float
     noise: float = 0.0
+
+    @cached_property
+    def tiles(self) -> TileStatistics:
+        """What each tile shows."""
+        gain = self.geometry.ramps @ self.fit.gain
+        return _make_statistics(self.level, self.window, self.plain, gain)
+
+    @cached_property
+    def expected_variances(self) -> Array:
+        """(tiles, 2, 2) covariance of each tile's score as the residuals of its pixels tell it."""
+        return _expect_variances(self)
 
     @property
     def length(self) -> float:
@@ -497,17 +510,16 @@ def align_reweighted(
         comparison = _compare(level, image, shift / level.factor, None, ALL_PIXELS, weights, noise)
         if isinstance(comparison, Rejection):
             return comparison
-        statistics = _measure_tiles(comparison)
+        statistics = comparison.tiles
         found = reweight(statistics)
         shift = comparison.improved * level.factor
         before = weights[statistics.rows, statistics.cols]
-        is_same = bool(np.array_equal(found, before))
-        covariance = _covariance(comparison)
-        converged = _has_converged(comparison, covariance)
-        if converged and (is_same or passes >= _MAX_REWEIGHTED):
-            break
-        if passes < _MAX_REWEIGHTED or not converged:
-            weights[statistics.rows, statistics.cols] = found
+        if passes >= min(_MAX_REWEIGHTED, _MAX_PASSES) or np.array_equal(found, before):
+            covariance = _covariance(comparison)
+            converged = _has_converged(comparison, covariance)
+            if converged:
+                break
+        weights[statistics.rows, statistics.cols] = found
     assert isinstance(comparison, _Comparison)
     information = comparison.fit.information
     chance = _find_chance_gradient(comparison.level, comparison.geometry, information, ALL_PIXELS)
@@ -642,13 +654,12 @@ def _expect_spread(comparison: _Comparison, powers: Array) -> Array:
     A tile has some hundred pixels, and only two scores: of a few tiles it is the better estimate. It does not see what
     moves a tile as a whole.
     """
-    both = np.einsum("tp,tq,tij->piqj", powers, powers, _expect_variances(comparison))
+    both = np.einsum("tp,tq,tij->piqj", powers, powers, comparison.expected_variances)
     return np.asarray(both.reshape(2 * powers.shape[1], -1))
 
 
 def _expect_variances(comparison: _Comparison) -> Array:
-    """(tiles, 2, 2) covariance of each tile's score as the residuals of its pixels tell it."""
-    tiles, level, window = _measure_tiles(comparison), comparison.level, comparison.window
+    tiles, level, window = comparison.tiles, comparison.level, comparison.window
     residual = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
     counts = level.pixel_counts[window.rows, window.cols]
     weights = comparison.geometry.normal_matrices[:, 3, 3] / counts.ravel()
@@ -791,7 +802,7 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     rows, cols = len(comparison.window.y), len(comparison.window.x)
     elements = [
         matrices.reshape(-1, 4)[:, [0, 1, 3]]
-        for matrices in (_expect_variances(comparison), _tile_information(comparison))
+        for matrices in (comparison.expected_variances, _tile_information(comparison))
     ]
     planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
     # Of a specimen that turns, the halves differ.
@@ -804,7 +815,7 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     chi2 = _chi_squares(np.ascontiguousarray(sums[:5]))
     # Images are never quite alike: as the least squares scatter, so do larger ones.
     least = chi2[0][chi2[0] > 0.0]
-    scatter = float(np.median(least)) / _MEDIAN_CHI2 if least.size else 1.0
+    scatter = median(least) / _MEDIAN_CHI2 if least.size else 1.0
     moves = sums[:, chi2 > _PULL_CHI2 * min(max(scatter, 1.0), _MOST_EXCESS)].T
     if not len(moves):
         return np.zeros(2)
