@@ -235,9 +235,11 @@ def _maximise_likelihood(
     if deviations > 0.0:
         # Minus twice the log likelihood rises by one at one deviation.
         still = float(found.fun) + deviations**2
-        highest = _LOG_RANGE[1]
+        highest = DENSITY_LOG_RANGE[1]
         if cost(highest) > still:
-            likely = float(brentq(lambda v: cost(v) - still, likely, highest, xtol=_LOG_TOLERANCE))
+            likely = float(
+                brentq(lambda v: cost(v) - still, likely, highest, xtol=DENSITY_LOG_TOLERANCE)
+            )
         else:
             # They tell no upper limit: the guess.
             likely = max(likely, 0.0)
