@@ -292,7 +292,11 @@ class SimilarityState:
         covariance = fit.covariance[4:, 4:]
         if self.filter is None:
             covariance = covariance + _floor(registration, frame)
-        unpredicted = np.abs(turn - self.expected_turn(key))
+        expected = self.expected_turn(key)
+        if self.filter is None and self.suspected is not None:
+            # An accepted frame has shown the beginning of it.
+            expected = expected + self.suspected[1]
+        unpredicted = np.abs(turn - expected)
         if not (
             _mahalanobis(fit.values[4:], covariance) > INNOVATION_CHI2_MAX
             and max(unpredicted) < UNPREDICTED_MAX
