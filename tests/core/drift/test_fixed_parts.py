@@ -139,6 +139,38 @@ def test_contrast_of_a_mean_does_not_grow() -> None:
     assert part[bright].mean() - np.median(part) == pytest.approx(truth, rel=0.06)
 
 
+@pytest.mark.slow
+def test_a_frame_that_may_be_pulled_is_no_part_of_a_mean() -> None:
+    frames, drift, _ = draw(KINDS["two tools"], 101)
+    tracker = DriftTracker()
+    updates = [tracker.update(frame, float(k)) for k, frame in enumerate(frames[:12])]
+    sigmas = np.array([np.sqrt(update.covariance[0, 0]) for update in updates])
+    # Two tips come in, and pull as long as they are not found.
+    pulled = np.flatnonzero(sigmas[1:] > 0.04) + 1
+    assert len(pulled) > 0
+    assert not any(updates[k].merged for k in pulled)
+    assert all(update.merged for update in updates[6:])
+    assert all(update.moving is not None for update in updates[6:])
+    # Later frames are as far off as the first one, by its noise; with a mean that was pulled, by 0.026 px.
+    errors = np.array([u.drift_px[0] - d[0] for u, d in zip(updates, drift[:12], strict=True)])
+    assert abs(float(np.mean(errors[8:]))) < 0.02
+
+
+@pytest.mark.slow
+def test_what_is_drawn_is_not_found_to_stay_once_more() -> None:
+    frames, _, _ = draw(KINDS["data bar"], 100)
+    tracker = DriftTracker()
+    averaged = []
+    for k, frame in enumerate(frames[:18]):
+        tracker.update(frame, float(k))
+        track = tracker._track
+        assert track is not None
+        assert track.store.current is not None
+        averaged.append(track.store[track.store.current].averaged)
+    # The bar is known from the second frame on; the mean grows on without being made anew.
+    assert averaged[4:] == list(range(averaged[4], averaged[4] + 14))
+
+
 def test_what_stays_pulls_by_its_part_of_the_gradients() -> None:
     # The same texture everywhere: a tenth of the area has a tenth of the gradients, twice that is allowed for.
     plain, tenth = picture((0.0, 0.0), 0, burnt=False), np.zeros((SIZE, SIZE), dtype=bool)

@@ -489,6 +489,23 @@ def test_the_density_of_a_path_is_found_from_a_guess_that_is_far_off(
     assert np.all(np.abs(np.log(np.array(found) / psd)) < 4.0 * 0.26 + 0.1)
 
 
+def test_one_deviation_more_than_the_likeliest_density_is_seldom_too_small() -> None:
+    truth, likeliest, larger = ProcessNoise(0.01, 1.0), [], []
+    for seed in range(16):
+        events, _ = simulated(np.random.default_rng(seed), np.arange(5.0), truth, 0.05)
+        for deviations, found in ((0.0, likeliest), (1.0, larger)):
+            # A guess that is as far off as that from the first step.
+            estimate = estimate_process_noise(
+                initial_state(0.0), events, ProcessNoise(0.16, 1.0), (1.0,), deviations
+            )
+            found.append(np.log(estimate.psd / truth.psd))
+    # Of four measurements, hardly any noise at all is often the likeliest.
+    assert np.min(likeliest) < -5.0
+    assert np.min(larger) > -3.0
+    # Five of six would be above if the likelihood were a normal one, but for the chance of sixteen series.
+    assert np.mean(np.array(larger) > 0.0) > 0.6
+
+
 def test_units_do_not_change_what_is_likely() -> None:
     found = []
     for unit in (1.0, 1e-9):
