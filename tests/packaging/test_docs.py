@@ -114,6 +114,34 @@ def test_docstrings_cite_pages_and_headings_that_exist() -> None:
     assert missing == []
 
 
+def _resolves(name: str) -> bool:
+    """Whether a dotted name is a module, or what one has."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found: Any = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            # Fields of a dataclass without a default are annotations only.
+            if part not in getattr(found, "__annotations__", {}):
+                found = getattr(found, part, None)
+        return found is not None
+    return False
+
+
+def test_cross_references_of_docstrings_lead_somewhere() -> None:
+    role = re.compile(r":(?:mod|class|func|meth|data|attr|exc):`~?(semcal_ros[\w.]*)`")
+    named = {
+        name: path.relative_to(ROOT)
+        for path in (ROOT / "semcal_ros").rglob("*.py")
+        for name in role.findall(path.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 50
+    assert {name: path for name, path in named.items() if not _resolves(name)} == {}
+    assert not _resolves("semcal_ros.core.calibration.joint")
+
+
 def test_the_page_of_flows_names_modules_that_exist() -> None:
     """With or without their folders, as `live_drift.py` or `nodes/frames/live_drift.py`."""
     text = (ROOT / "doc" / "how_it_runs.md").read_text(encoding="utf-8")

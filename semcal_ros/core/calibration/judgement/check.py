@@ -213,7 +213,7 @@ def check_calibration(
     image_size
         (width, height) of the images.
     untilted, axis
-        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`.
+        As in :class:`~semcal_ros.core.calibration.options.CalibrationOptions`.
 
     Raises
     ------

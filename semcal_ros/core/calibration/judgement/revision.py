@@ -16,7 +16,7 @@
 
 The camera of the views is that of the calibration, uncertain by its covariance, plus changes that all
 magnifications share. Poses, visits, drift, the shape of the grid and the stage are adjusted as in a calibration
-(:mod:`~semcal_ros.core.calibration.joint`).
+(:mod:`~semcal_ros.core.calibration.pipeline`).
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def make_setup(
     image_size
         (width, height) of the images.
     untilted, axis
-        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`.
+        As in :class:`~semcal_ros.core.calibration.options.CalibrationOptions`.
 
     Raises
     ------

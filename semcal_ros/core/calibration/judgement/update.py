@@ -92,7 +92,7 @@ def update_calibration(
     image_size
         (width, height) of the images.
     untilted, axis
-        As in :class:`~semcal_ros.core.calibration.calibrate.CalibrationOptions`.
+        As in :class:`~semcal_ros.core.calibration.options.CalibrationOptions`.
     ageing
         1-sigma of a relative change of the scale since the calibration; that of the other parameters is what
         displaces the edge of the image by a fifth of that. 0: what has not provably changed stays.
