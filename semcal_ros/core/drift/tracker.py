@@ -103,6 +103,8 @@ _MIN_MERGE_CORRELATION, _MERGE_GAINS, _MAX_MERGE_SHEAR_PX = 0.85, (0.5, 2.0), 0.
 # Standard deviations of a measured shear within which it may be none, and the largest one then: a quarter of a pixel to
 # either side at the upper and the lower edge blurs structure at a third of a cycle per pixel by 4 % there.
 _OPEN_SIGMAS, _MAX_BLUR_PX = 2.0, 0.5
+# Deviations of a rotation that is seen: by chance once in 16 000 frames.
+_TURNED_SIGMAS = 4.0
 # 1-sigma of a shift from which a frame would blur the mean as much.
 _MAX_PLACE_PX = 0.2
 # A frame's position as a keyframe is that which was measured, noise and all; but as a reference its
@@ -1000,8 +1002,14 @@ def _is_mergeable(match: _Match, store: KeyframeStore) -> bool:
         and float(np.max(shear_px)) < _MAX_BLUR_PX
         and float(np.max(np.diag(registration.covariance))) < _MAX_PLACE_PX**2
         # A mean that is pulled stays so, and all that is registered against it.
-        and not alignment.may_be_pulled
+        and (not alignment.may_be_pulled or _seems_turned(registration))
     )
+
+
+def _seems_turned(registration: Registration) -> bool:
+    """Whether a rotation is seen, which displaces parts of the image as something that moves by itself does."""
+    fit = registration.fit_similarity()
+    return fit is not None and bool(fit.values[4] ** 2 > _TURNED_SIGMAS**2 * fit.covariance[4, 4])
 
 
 def _rekey(track: _Track, frame: ScanFrame, match: _Match, measure: Measure, noise: Array) -> int:
