@@ -163,10 +163,10 @@ def test_what_is_drawn_is_not_found_to_stay_once_more() -> None:
     averaged = []
     for k, frame in enumerate(frames[:18]):
         tracker.update(frame, float(k))
-        track = tracker._track
-        assert track is not None
-        assert track.store.current is not None
-        averaged.append(track.store[track.store.current].averaged)
+        assert tracker.state is not None
+        keyframes = tracker.state.keyframes
+        assert keyframes.current is not None
+        averaged.append(keyframes[keyframes.current].averaged)
     # The bar is known from the second frame on; the mean grows on without being made anew.
     assert averaged[4:] == list(range(averaged[4], averaged[4] + 14))
 
