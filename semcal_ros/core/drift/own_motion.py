@@ -45,7 +45,6 @@ from semcal_ros.core.drift.thresholds import (
     BODY_REST_FRAMES,
     BODY_REST_FRAMES_MAX,
     BODY_SEARCHES,
-    BODY_SIDE_PX_MIN,
     BODY_SIGMA_PX_MAX,
     BODY_SMOOTHED_PX,
     BODY_SQUARE_PX,
@@ -66,6 +65,7 @@ from semcal_ros.core.registration.noise_spectrum import (
 )
 from semcal_ros.core.registration.reference import Region
 from semcal_ros.core.registration.register import to_gray
+from semcal_ros.core.registration.thresholds import SIDE_PX_MIN
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel, drop_pixels, make_level
 
 
@@ -251,7 +251,7 @@ def measure_displacement(
         min(bottom + reach, now.region[3]),
     )
     first, second = _cut(before.image, cut), _cut(now.image, wide)
-    if min(second.shape) < BODY_SIDE_PX_MIN:
+    if min(second.shape) < SIDE_PX_MIN:
         return None
     noise = estimate_noise_variance(to_gray(now.image))
     smoothed = passed_variance(BODY_SMOOTHED_PX) * noise
@@ -317,7 +317,7 @@ def _find_body(frame: BodyFrame) -> tuple[Region, Mask] | None:
         corner, side = float(frame.moving.corner_px[axis]), float(frame.moving.side_px[axis])
         low = corner + side * (begin - 1) - BODY_MARGIN_PX
         high = corner + side * (begin + length + 1) + BODY_MARGIN_PX
-        short = max(0.0, BODY_SIDE_PX_MIN - (high - low))
+        short = max(0.0, SIDE_PX_MIN - (high - low))
         spans.append(
             (
                 max(int(np.floor(low - 0.5 * short)), frame.region[axis]),
@@ -325,7 +325,7 @@ def _find_body(frame: BodyFrame) -> tuple[Region, Mask] | None:
             )
         )
     (left, right), (top, bottom) = spans
-    if min(right - left, bottom - top) < BODY_SIDE_PX_MIN:
+    if min(right - left, bottom - top) < SIDE_PX_MIN:
         return None
     only = MovingTiles(labels == largest, frame.moving.corner_px, frame.moving.side_px, 0.0)
     x, y = np.arange(left, right, dtype=np.float64), np.arange(top, bottom, dtype=np.float64)

@@ -322,10 +322,6 @@ BODY_MARGIN_PX = TABLE.stated(
     "BODY_MARGIN_PX", 10, "px",
     "Around a body that are compared, too: smoothing and interpolation reach some of them.",
 )
-BODY_SIDE_PX_MIN = TABLE.derived(
-    "BODY_SIDE_PX_MIN", 48, "px",
-    "Of what is compared: as of an image, for 6 x 6 tiles of 6 px between the margins of the filters.",
-)
 BODY_SMOOTHED_PX = TABLE.stated(
     "BODY_SMOOTHED_PX", 1.0, "px",
     "Smoothing of both images, which halves their noise and leaves the edges.",

@@ -23,13 +23,11 @@ from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import Alignment
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import RegistrationSettings
-
-# The coarse peak is the vertex of a parabola, good to a sample of its surface; the rest is for
-# textures whose reduced images alias.
-_STAGE_TOLERANCE_PX = 1.0
-# The two halves may differ by chance, and by what distortion is left in the images: 0.3 px is a
-# change of scale of 1 part in 1000 over the 300 px between the middles of halves of 600 px.
-_HALVES_SIGMAS, _HALVES_TOLERANCE_PX = 5.0, 0.3
+from semcal_ros.core.registration.thresholds import (
+    HALVES_PX_MAX,
+    HALVES_SIGMAS,
+    STAGES_APART_PX_MAX,
+)
 
 
 def find_divergence(alignment: Alignment) -> Rejection[MatchFailure] | None:
@@ -79,7 +77,7 @@ def find_failure(
             MatchFailure.UNDETERMINED, f"too little structure for its noise (sigma {worst:.2f} px)"
         )
     apart = float(np.max(np.abs(alignment.shift_px - peak.shift_px)))
-    if apart > peak.step_px + _STAGE_TOLERANCE_PX:
+    if apart > peak.step_px + STAGES_APART_PX_MAX:
         return Rejection(
             MatchFailure.STAGES_DISAGREE, f"coarse and fine shift differ by {apart:.1f} px"
         )
@@ -88,7 +86,7 @@ def find_failure(
             MatchFailure.DISSIMILAR,
             f"images differ (noise-corrected correlation {correlation:.2f})",
         )
-    allowed = _HALVES_SIGMAS * np.sqrt(alignment.half_variance) + _HALVES_TOLERANCE_PX
+    allowed = HALVES_SIGMAS * np.sqrt(alignment.half_variance) + HALVES_PX_MAX
     shear = np.abs(alignment.joint_px[2:])
     if np.all(shear <= max_shear_px):
         # Between the upper and the lower half, only the departure from one line counts.

@@ -28,18 +28,15 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-
-_ITERATIONS, _EPSILON = 200, 1e-8
-# Sigma of the Gaussian that both images are smoothed with, px: shot noise has no scale.
-_SMOOTHING_PX = 1.5
-# Below this correlation the images do not show the same, or noise hides it.
-_LEAST_CORRELATION = 0.3
-# Pixels at the border that are left out: interpolation and smoothing reach there.
-_BORDER_PX = 8
-# What interpolation leaves at the ends of the template, px: measured on noiseless textures.
-_FLOOR_PX = 0.02
-# Lags up to which the correlation of the residuals is added up, px.
-_LAGS_PX = 8
+from semcal_ros.core.registration.thresholds import (
+    AFFINE_BORDER_PX,
+    AFFINE_CONVERGED,
+    AFFINE_CORRELATION_MIN,
+    AFFINE_FLOOR_PX,
+    AFFINE_LAGS_PX,
+    AFFINE_SMOOTHED_PX,
+    AFFINE_STEPS_MAX,
+)
 
 
 class NotAlignedError(SemcalError):
@@ -90,20 +87,20 @@ def align_affine(template: Array32, image: Array32) -> AffineAlignment:
             expected="at least 48 px, and not more than the image",
         )
     small, large = (
-        np.asarray(cv2.GaussianBlur(part, (0, 0), _SMOOTHING_PX), dtype=np.float32)
+        np.asarray(cv2.GaussianBlur(part, (0, 0), AFFINE_SMOOTHED_PX), dtype=np.float32)
         for part in (template, image)
     )
-    border = _BORDER_PX
+    border = AFFINE_BORDER_PX
     inner = np.ascontiguousarray(small[border:-border, border:-border])
     scores = cv2.matchTemplate(large, inner, cv2.TM_CCOEFF_NORMED)
     _, best, _, (left, top) = cv2.minMaxLoc(scores)
-    if not best >= 0.5 * _LEAST_CORRELATION:
+    if not best >= 0.5 * AFFINE_CORRELATION_MIN:
         raise NotAlignedError(
             f"images that correlate by {best:.2f} at most",
             expected="two images of one place, with texture, no more than a factor of 4 apart",
         )
     warp = np.array([[1.0, 0.0, left], [0.0, 1.0, top]], dtype=np.float32)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _EPSILON)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, AFFINE_STEPS_MAX, AFFINE_CONVERGED)
     try:
         correlation, warp = cv2.findTransformECC(
             inner,
@@ -119,7 +116,7 @@ def align_affine(template: Array32, image: Array32) -> AffineAlignment:
             "images whose alignment does not converge",
             expected="two images of one place, with texture",
         ) from error
-    if not correlation >= _LEAST_CORRELATION:
+    if not correlation >= AFFINE_CORRELATION_MIN:
         raise NotAlignedError(
             f"images that correlate by {correlation:.2f}",
             expected="two images of one place, with texture",
@@ -149,7 +146,7 @@ def _estimate_covariance(template: Array32, image: Array32, warp: Array32) -> Ar
     variance = float(np.mean(residual**2)) * _sum_correlation(residual)
     covariance = variance * inverse / np.outer(scale, scale)
     keep = [0, 1, 3, 4]
-    floor = np.tile((_FLOOR_PX / (0.5 * np.array(size))) ** 2, 2)
+    floor = np.tile((AFFINE_FLOOR_PX / (0.5 * np.array(size))) ** 2, 2)
     return np.asarray(covariance[np.ix_(keep, keep)] + np.diag(floor), dtype=np.float64)
 
 
@@ -158,8 +155,8 @@ def _sum_correlation(residual: Array) -> float:
     centred = residual - residual.mean()
     power = float(np.mean(centred**2)) or 1.0
     total = 0.0
-    for dy in range(-_LAGS_PX, _LAGS_PX + 1):
-        for dx in range(-_LAGS_PX, _LAGS_PX + 1):
+    for dy in range(-AFFINE_LAGS_PX, AFFINE_LAGS_PX + 1):
+        for dx in range(-AFFINE_LAGS_PX, AFFINE_LAGS_PX + 1):
             first = centred[
                 max(dy, 0) : centred.shape[0] + min(dy, 0),
                 max(dx, 0) : centred.shape[1] + min(dx, 0),

@@ -34,37 +34,28 @@ from semcal_ros.core.arrays import Array, Mask, median, quantile
 from semcal_ros.core.registration.fractional_delay import gradients
 from semcal_ros.core.registration.inverse_compositional import TileStatistics
 from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
+from semcal_ros.core.registration.thresholds import (
+    AGREEMENT_SIGMAS,
+    BESIDES_MAX,
+    BEST_TILES,
+    BODY_TILES_MIN,
+    CHANGE_PRECISION,
+    COMPLETE_SHARE_MIN,
+    DISAGREEING_MAX,
+    GAIN_MIN,
+    GAIN_RATIO_MAX,
+    MISSING_MAX,
+    MOVING_TILES_MIN,
+    SHOWN_TILE_PX,
+    STILL_SHIFT_PX_MIN,
+    STILL_SIGMAS,
+    STRETCH_PX_MAX,
+    SUSPECT_SIGMAS,
+    TELLING_SIGMA_PX_MAX,
+    TELLING_TILES_MIN,
+    TILE_SHIFT_PX_MAX,
+)
 from semcal_ros.core.registration.tiles import band_of
-
-# What of the structure of a tile may be missing, or be there besides, as a part of it: contrast changes with charging,
-# focus and contamination by some tenths over a field.
-_MISSING, _BESIDES = 0.4, 0.6
-# Standard deviations of the noise by which it must exceed that: once in 10^5 tiles that agree.
-_SIGMAS = 4.5
-# Tiles into which pixels are gathered that are only to be shown.
-_PIXEL_TILES_PX = 8
-# A shift of a tile of its own, px: distortion and interpolation leave some hundredths.
-_OWN_SHIFT_PX = 0.15
-# Part of the tiles that fit best.
-_BEST_TILES = 0.3
-# Standard deviations from which a tile is looked at together with its neighbours.
-_SUSPECT = 3.5
-# Tiles that tell a gain, the least that a median of them can be, and the range about it.
-_LEAST_TELLING, _LEAST_GAIN, _GAIN_RANGE = 12, 0.3, 1.5
-# Part of the structure that agrees with a shift where all of the image moves by it.
-_ALL_AGREES = 0.97
-# Tiles of a body that moves, at least.
-_LEAST_TILES = 2
-# By how much the shift may change from the middle of the rows to their ends, px, as halves of an image may disagree.
-_LARGEST_STRETCH_PX = 0.3
-# Part of the tiles that disagree, from which on most of them must be in bodies, and how many tiles make one.
-_FEW_DISAGREE, _BODY_TILES = 0.05, 4
-# A tile whose own shift is less certain than this says nothing by it.
-_TELLING_PX = 0.5
-# Of the terms of a shift that changes over the field, 1 / px^2: those that tiles in a row leave open are none.
-_LEAST_PRECISION = 1e-3
-# Where something moved in the image before, less of a shift is enough: px, and deviations of the mean of its tiles.
-_STILL_SHIFT_PX, _STILL_SIGMAS = 0.05, 3.0
 
 
 @dataclass(frozen=True)
@@ -129,20 +120,20 @@ class Agreement:
     @property
     def is_complete(self) -> bool:
         """Whether all of the image agrees: no body does not, not even where the ground has no structure."""
-        most = self.share > _ALL_AGREES and self.pull < 1.0 - _ALL_AGREES
-        return most and not np.any(keep_bodies(self.disagrees, _BODY_TILES))
+        most = self.share > COMPLETE_SHARE_MIN and self.pull < 1.0 - COMPLETE_SHARE_MIN
+        return most and not np.any(keep_bodies(self.disagrees, BODY_TILES_MIN))
 
     @property
     def are_bodies(self) -> bool:
         """Whether the tiles that disagree lie together; scattered ones say that the images differ everywhere."""
         tiles = int(np.count_nonzero(self.disagrees))
-        if tiles <= _FEW_DISAGREE * self.disagrees.size:
+        if tiles <= DISAGREEING_MAX * self.disagrees.size:
             return True
         _, _, statistics, _ = cv2.connectedComponentsWithStats(
             self.disagrees.astype(np.uint8), connectivity=4
         )
         areas = statistics[1:, cv2.CC_STAT_AREA]
-        return bool(areas[areas >= _BODY_TILES].sum() > 0.6 * tiles)
+        return bool(areas[areas >= BODY_TILES_MIN].sum() > 0.6 * tiles)
 
 
 def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise) -> Array:
@@ -155,7 +146,7 @@ def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: 
     expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
     # Smoothed noise has fewer independent pixels.
     scatter = expected * np.sqrt(shared_pixels(sigma_px) / pixels)
-    signal = np.where(energy - expected > _SIGMAS * scatter, energy - expected, 0.0)
+    signal = np.where(energy - expected > AGREEMENT_SIGMAS * scatter, energy - expected, 0.0)
     own = signal / np.maximum(signal + expected, 1e-30)
     return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
 
@@ -174,7 +165,7 @@ def find_agreement(
     # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.
     # A tile of which little counts may leave anything.
     whole = count >= 0.5 * float(np.max(count))
-    least = quantile((raw / count)[whole], _BEST_TILES)
+    least = quantile((raw / count)[whole], BEST_TILES)
     floor = gain**2 * noise.reference + noise.image
     hidden = max(1.0, least / max(median(floor), 1e-30))
     floor = hidden * floor
@@ -182,17 +173,19 @@ def find_agreement(
     # Scatter of sums of products of smoothed noise.
     scatter = np.sqrt(shared * (count * floor**2 + 2.0 * structure * floor))
     missing = structure - gain * tiles.common
-    lacks = missing > _MISSING * structure + _SIGMAS * scatter
+    lacks = missing > MISSING_MAX * structure + AGREEMENT_SIGMAS * scatter
     left = raw - count * floor
     # Where it is bright, electrons scatter more than where the noise was measured: twice as much is nothing.
-    exceeds = left > _BESIDES * structure + count * floor + _SIGMAS * np.sqrt(2.0) * scatter
+    exceeds = (
+        left > BESIDES_MAX * structure + count * floor + AGREEMENT_SIGMAS * np.sqrt(2.0) * scatter
+    )
     disagrees = lacks | exceeds
     louder = replace(noise, reference=hidden * noise.reference, image=hidden * noise.image)
     disagrees = disagrees | _moves(tiles, weights, louder, shared, ~disagrees, suspected)
     # By area: a bright tool has more of a gradient than all of the ground.
     share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
-    body = fill_bodies(keep_bodies(disagrees, _BODY_TILES))
+    body = fill_bodies(keep_bodies(disagrees, BODY_TILES_MIN))
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * (tiles.gradient[..., 0, 0] + tiles.gradient[..., 1, 1])
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
@@ -216,11 +209,11 @@ def _bound_gain(tiles: TileStatistics, noise: TileNoise, weights: Array) -> Arra
     gain = np.maximum(tiles.gain, 0.0)
     ratios = tiles.common[telling] / known[telling]
     # What came in has nothing in common with what it covers.
-    ratios = ratios[ratios > _LEAST_GAIN]
-    if len(ratios) < _LEAST_TELLING:
+    ratios = ratios[ratios > GAIN_MIN]
+    if len(ratios) < TELLING_TILES_MIN:
         return gain
     middle = median(ratios)
-    return np.clip(gain, middle / _GAIN_RANGE, middle * _GAIN_RANGE)
+    return np.clip(gain, middle / GAIN_RATIO_MAX, middle * GAIN_RATIO_MAX)
 
 
 def fill_bodies(found: Mask, gap: int = 3) -> Mask:
@@ -260,11 +253,11 @@ def _moves(
             * (gain**2 * noise.reference + noise.image)[..., None]
             / (energy * gain[..., None])
         )
-    telling = (variance < _TELLING_PX**2) & counts[..., None]
+    telling = (variance < TELLING_SIGMA_PX_MAX**2) & counts[..., None]
     rows, cols = weights.shape
     is_suspected = suspected is not None and bool(np.any(suspected))
     if not is_suspected and not np.any(
-        np.abs(own[telling]) > _OWN_SHIFT_PX + _SUSPECT * np.sqrt(variance[telling])
+        np.abs(own[telling]) > TILE_SHIFT_PX_MAX + SUSPECT_SIGMAS * np.sqrt(variance[telling])
     ):
         # Nearly always: no tile is off at all.
         return np.zeros((rows, cols), dtype=bool)
@@ -273,33 +266,33 @@ def _moves(
     shifts, precisions = np.zeros((2, rows, cols)), np.zeros((2, rows, cols))
     for axis in (0, 1):
         known = telling[..., axis]
-        if np.count_nonzero(known) < _LEAST_TELLING:
+        if np.count_nonzero(known) < TELLING_TILES_MIN:
             continue
         design = terms_of_tiles[known]
         value, sigma = own[..., axis][known], np.sqrt(variance[..., axis][known])
         fitted = np.ones(len(value), dtype=bool)
-        if suspected is not None and np.count_nonzero(known & ~suspected) >= _LEAST_TELLING:
+        if suspected is not None and np.count_nonzero(known & ~suspected) >= TELLING_TILES_MIN:
             fitted = ~suspected[known]
         # What the ground leaves of a line; a bright edge is surer of itself than all the ground.
-        spread = np.hypot(sigma, _OWN_SHIFT_PX)
+        spread = np.hypot(sigma, TILE_SHIFT_PX_MAX)
         terms, before = np.array([median(value[fitted]), 0.0, 0.0]), None
         for _ in range(3):
             left = np.abs(value - design @ terms)
-            good = fitted & (left <= 3.0 * max(median(left[fitted]), _OWN_SHIFT_PX))
+            good = fitted & (left <= 3.0 * max(median(left[fitted]), TILE_SHIFT_PX_MAX))
             if before is not None and np.array_equal(good, before):
                 break
             before = good
             scaled = design * (good / spread**2)[:, None]
-            inverse = np.linalg.inv(scaled.T @ design + _LEAST_PRECISION * np.eye(3))
+            inverse = np.linalg.inv(scaled.T @ design + CHANGE_PRECISION * np.eye(3))
             terms = inverse @ (scaled.T @ value)
         value = _without_rows(value - design @ terms, known)
         left = np.abs(value)
         scatter = max(1.0, 1.4826 * median(left / sigma))
         uncertain = scatter * np.sqrt(float(inverse[1, 1]))
-        if abs(float(terms[1])) > _LARGEST_STRETCH_PX + _SIGMAS * uncertain:
+        if abs(float(terms[1])) > STRETCH_PX_MAX + AGREEMENT_SIGMAS * uncertain:
             # What changes along a row is no drift: the specimen is strained or turned, and no part of it is a tool.
             return np.ones_like(found)
-        found[known] |= left > _OWN_SHIFT_PX + _SIGMAS * sigma
+        found[known] |= left > TILE_SHIFT_PX_MAX + AGREEMENT_SIGMAS * sigma
         # What is too little in one tile its neighbours tell, if they move alike.
         precision, signed = precisions[axis], shifts[axis]
         precision[known], signed[known] = sigma**-2.0, value
@@ -308,7 +301,7 @@ def _moves(
         mean = mean / np.maximum(total, 1e-30)
         together = 1.0 / np.sqrt(np.maximum(9.0 * total, 1e-30))
         alike = np.sign(signed) == np.sign(mean)
-        found |= known & alike & (np.abs(mean) > _OWN_SHIFT_PX + _SIGMAS * together)
+        found |= known & alike & (np.abs(mean) > TILE_SHIFT_PX_MAX + AGREEMENT_SIGMAS * together)
     if suspected is not None and is_suspected:
         found |= _still_move(suspected & counts, shifts, precisions)
     return found
@@ -333,7 +326,7 @@ def _still_move(suspected: Mask, shifts: Array, precisions: Array) -> Mask:
         total = np.bincount(labels.ravel(), precision.ravel(), count)
         weighted = np.bincount(labels.ravel(), (precision * shift).ravel(), count)
         mean = np.asarray(weighted, dtype=np.float64) / np.maximum(total, 1e-30)
-        is_shift = np.abs(mean) > _STILL_SHIFT_PX + _STILL_SIGMAS / np.sqrt(
+        is_shift = np.abs(mean) > STILL_SHIFT_PX_MIN + STILL_SIGMAS / np.sqrt(
             np.maximum(total, 1e-30)
         )
         found |= is_shift[labels]
@@ -347,7 +340,7 @@ def _without_rows(values: Array, known: Mask) -> Array:
     grid = np.full(known.shape, np.inf)
     grid[known] = values
     counts = np.count_nonzero(known, axis=1)
-    enough = counts >= _LEAST_TELLING // 2
+    enough = counts >= TELLING_TILES_MIN // 2
     # The median of what is known of each row, which sorts to its front: a tenth of the time of numpy.nanmedian.
     ordered, middle = np.sort(grid[enough], axis=1), counts[enough] // 2
     row = np.arange(len(ordered))
@@ -378,7 +371,7 @@ class MovingTiles:
     @classmethod
     def of(cls, disagrees: Mask, corner_px: Array, side_px: Array) -> MovingTiles:
         """From the tiles that disagree: a body has no holes, and is more than one tile."""
-        filled = fill_bodies(keep_bodies(disagrees, _LEAST_TILES))
+        filled = fill_bodies(keep_bodies(disagrees, MOVING_TILES_MIN))
         return cls(filled, corner_px, side_px, float(filled.mean()))
 
     @classmethod
@@ -386,7 +379,7 @@ class MovingTiles:
         """From the pixels of an image (h, w), in tiles of 8 px of which one pixel is enough; the share is that of the
         pixels.
         """
-        side = _PIXEL_TILES_PX
+        side = SHOWN_TILE_PX
         grown = np.pad(mask, [(0, -n % side) for n in mask.shape])
         rows, cols = (n // side for n in grown.shape)
         tiles = np.asarray(grown.reshape(rows, side, cols, side).any(axis=(1, 3)))

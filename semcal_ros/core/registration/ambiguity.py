@@ -33,20 +33,14 @@ from semcal_ros.core.registration.inverse_compositional import (
 )
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference
+from semcal_ros.core.registration.thresholds import (
+    COMMON_TILES_MIN,
+    CONTRADICTION_MIN,
+    PREDICTED_CHI2_MAX,
+    RESIDUAL_DIFFERENCE_MIN,
+    SAME_SHIFT_PX,
+)
 from semcal_ros.core.registration.tiles import Pyramid
-
-# Part of the residual by which two shifts must differ to be told apart: below it, the error of the
-# interpolation, which depends on the fraction of the shift, decides instead of the specimen.
-_MIN_RESIDUAL_DIFFERENCE = 0.05
-# The same for an image to contradict a prediction: sharp lattices look a little different wherever
-# their pixels fall.
-_MIN_CONTRADICTION = 0.3
-# Peaks that were refined to within this distance of each other are the same shift.
-_SAME_SHIFT_PX = 0.5
-# A prediction covers a peak within three standard deviations.
-_PREDICTED_CHI2 = 9.0
-# Standard errors of a mean over fewer tiles are themselves wrong by more than a fifth.
-_MIN_COMMON_TILES = 16
 
 
 def choose_peak(
@@ -101,7 +95,7 @@ def choose_peak(
             best = peak, alignment, energies
             continue
         shift, other = best[1].shift_px, alignment.shift_px
-        if float(np.max(np.abs(other - shift))) < _SAME_SHIFT_PX:
+        if float(np.max(np.abs(other - shift))) < SAME_SHIFT_PX:
             continue
         deviations = compare_residuals(best[2], energies)
         if abs(deviations) < limits.min_deviations:
@@ -139,7 +133,7 @@ def _prefer_prediction(
         else tile_residual_energies(reference.levels[-1], pyramid, alignment.shift_px)
         for alignment in alignments
     ]
-    deviations = compare_residuals(energies[0], energies[1], _MIN_CONTRADICTION)
+    deviations = compare_residuals(energies[0], energies[1], CONTRADICTION_MIN)
     if deviations < -reference.settings.min_deviations:
         x, y = highest.shift_px
         return Rejection(
@@ -153,11 +147,11 @@ def _is_predicted(peak: CoarsePeak, guess: Array, guess_covariance: Array) -> bo
     """Whether a peak lies within three deviations of the prediction."""
     innovation = np.asarray(peak.shift_px) - guess
     covariance = guess_covariance + np.eye(2) * (0.5 * peak.step_px) ** 2
-    return float(innovation @ np.linalg.solve(covariance, innovation)) <= _PREDICTED_CHI2
+    return float(innovation @ np.linalg.solve(covariance, innovation)) <= PREDICTED_CHI2_MAX
 
 
 def compare_residuals(
-    first: Array | None, second: Array | None, least: float = _MIN_RESIDUAL_DIFFERENCE
+    first: Array | None, second: Array | None, least: float = RESIDUAL_DIFFERENCE_MIN
 ) -> float:
     """By how many standard errors the second shift explains the common tiles worse than the first.
 
@@ -170,7 +164,7 @@ def compare_residuals(
         return -np.inf
     difference = (second - first).ravel()
     common = np.isfinite(difference)
-    if np.count_nonzero(common) < _MIN_COMMON_TILES:
+    if np.count_nonzero(common) < COMMON_TILES_MIN:
         return 0.0
     difference = difference[common]
     mean = float(difference.mean())

@@ -28,13 +28,8 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.registration.reference import Reference, Region
+from semcal_ros.core.registration.thresholds import DROPPED_WITHIN_PX, SMEARED_PX
 from semcal_ros.core.registration.tiles import drop_pixels
-
-# Pixels around them into which the filters of gradients and of interpolation smear them, with more than a twentieth of
-# their weight, beyond the smoothing.
-_SMEARED_PX = 2
-# How far the shift at which they are dropped may be from the one that is found.
-_MOVED_PX = 1
 
 
 def grow_mask(mask: Mask, by_px: int) -> Mask:
@@ -71,12 +66,12 @@ def drop_fixed_pixels(
         return reference
     width, height = level.size
     dropped = np.zeros((height, width), dtype=bool)
-    reach = _SMEARED_PX + int(np.ceil(level.sigma_px))
+    reach = SMEARED_PX + int(np.ceil(level.sigma_px))
     if reference.fixed is not None:
         dropped |= grow_mask(reference.fixed, reach)
     if fixed is not None:
         left, top, right, bottom = region or (0, 0, fixed.shape[1], fixed.shape[0])
-        around = grow_mask(fixed[top:bottom, left:right], reach + _MOVED_PX)
+        around = grow_mask(fixed[top:bottom, left:right], reach + DROPPED_WITHIN_PX)
         origin = np.subtract((left, top), reference.region[:2])
         # Where the reference shows what the image shows at its corner.
         x, y = (int(v) for v in np.rint(origin - np.asarray(shift_px)))

@@ -33,14 +33,13 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from semcal_ros.core.arrays import AnyImage, Array, Image
-
-# Frequencies at which a filter of up to 16 taps is fitted: four times as many.
-_SAMPLES = 64
-# Of the diagonal of the normal matrix, added to it: what lies outside the band is left free, and
-# this keeps the weights small there.
-_RIDGE = 1e-9
-# Squared frequency, (rad/px)^2, below which the power of an image is taken as constant.
-_FLAT_BELOW = 0.05
+from semcal_ros.core.registration.thresholds import (
+    BAND_EDGES,
+    BAND_TAPS,
+    FILTER_FREQUENCIES,
+    FILTER_RIDGE,
+    FLAT_BELOW,
+)
 
 
 @dataclass(frozen=True)
@@ -71,16 +70,16 @@ class Band:
     @property
     def frequencies(self) -> Array:
         """(64,) frequencies at which the filters are fitted."""
-        return np.asarray((np.arange(_SAMPLES) + 0.5) / _SAMPLES * self.edge)
+        return np.asarray((np.arange(FILTER_FREQUENCIES) + 0.5) / FILTER_FREQUENCIES * self.edge)
 
     @property
     def weights(self) -> Array:
         """(64,) their weights: images have most of their power at low frequencies."""
-        return np.asarray(1.0 / (_FLAT_BELOW + self.frequencies**2))
+        return np.asarray(1.0 / (FLAT_BELOW + self.frequencies**2))
 
 
 #: For images that are smooth, and for sharp ones with little noise.
-FINE, SHARP = Band(0.72 * np.pi, 12), Band(0.8 * np.pi, 16)
+FINE, SHARP = (Band(edge, taps) for edge, taps in zip(BAND_EDGES, BAND_TAPS, strict=True))
 
 
 @lru_cache(maxsize=2)
@@ -90,7 +89,7 @@ def _invert_normal_matrix(band: Band) -> Array:
     difference = offsets[:, None] - offsets[None, :]
     cosines = np.cos(band.frequencies[:, None, None] * difference)
     normal = np.tensordot(band.weights, cosines, axes=1)
-    normal += _RIDGE * normal[0, 0] * np.eye(band.taps)
+    normal += FILTER_RIDGE * normal[0, 0] * np.eye(band.taps)
     return np.asarray(np.linalg.inv(normal))
 
 

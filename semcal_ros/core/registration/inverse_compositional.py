@@ -47,6 +47,38 @@ from semcal_ros.core.arrays import Array, equilibrate, median
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.noise_spectrum import shared_pixels
+from semcal_ros.core.registration.thresholds import (
+    ALL_PIXELS,
+    BLOCK_SIGMAS,
+    BLOCKS_MIN,
+    CHANCE_SIGMAS,
+    COARSE_PASSES_MAX,
+    COARSE_STEP_PX,
+    CONDITION_MAX,
+    CONTRACTION,
+    CURVATURE,
+    EXPECTED_SCORES,
+    FEW_SCORES,
+    FREEDOM_MIN,
+    GAIN_MIN,
+    HESSIAN_PIXELS,
+    MEDIAN_CHI2,
+    NOISE_ROWS_MIN,
+    PASSES_MAX,
+    PULL_CHI2_MIN,
+    PULL_EXCESS_MAX,
+    PULL_REST_MIN,
+    PULL_SIDES,
+    REMAINING_PX,
+    REMAINING_SIGMAS,
+    REWEIGHTED_PASSES_MAX,
+    ROUNDING,
+    ROWS_PER_MODE,
+    ROWS_RATIO_MIN,
+    SHEAR_ROWS_MIN,
+    STEP_PX_MAX,
+    THREE_SIGMAS,
+)
 from semcal_ros.core.registration.tile_least_squares import (
     TileFit,
     TileGeometry,
@@ -57,8 +89,6 @@ from semcal_ros.core.registration.tile_least_squares import (
     well_posed,
 )
 from semcal_ros.core.registration.tiles import (
-    ALL_PIXELS,
-    HESSIAN_PIXELS,
     Pyramid,
     PyramidLevel,
     TileSums,
@@ -67,62 +97,6 @@ from semcal_ros.core.registration.tiles import (
     tile_window,
 )
 
-# A start that needs more steps than these is outside the range of convergence.
-_MAX_PASSES = 12
-_MAX_COARSE_PASSES = 4
-# The number of scores that count is itself uncertain where it is small.
-_LEAST_FREEDOM = 8.0
-# Fewer than this make up most of the information only where it lies in lone particles.
-_FEW_SCORES = 40.0
-# Then the covariance that the residuals of the pixels lead to counts as that of so many scores: what moves a particle
-# as a whole, such as a change of its shape, is seen by the scatter of the scores alone.
-_EXPECTED_SCORES = 6.0
-# Probability below three standard deviations.
-_THREE_SIGMAS = 0.99865
-# Less of a gain is that of another place.
-_LEAST_GAIN = 0.3
-# Passes in which the weights of tiles may change.
-_MAX_REWEIGHTED = 8
-# The gradient extrapolates over a pixel or two of a sharp image; longer steps may overshoot.
-_MAX_STEP_PX = 1.5
-# A coarse level is left when its step is this short (px of the level), less than half a pixel of
-# the next one.
-_COARSE_STEP_PX = 0.2
-# What remains after a step is at most this part of it, and its square over the images' finest
-# structure.
-_CONTRACTION = 0.06
-_CURVATURE = 0.5
-# What may remain: 0.12 sigma adds 0.7 % to the error of the shift; below 0.0005 px interpolation
-# errors rule.
-_TOLERATED_SIGMAS = 0.12
-_MIN_TOLERANCE_PX = 5e-4
-# Scores of tiles that are nearer than this to each other share smoothed noise: a Gaussian of sigma,
-# applied to both images, correlates over some 4 sigma to either side; blocks are three times as
-# large, so that little of their sums is shared.
-_BLOCK_SIGMAS = 14.0
-# The scatter of 36 blocks tells a sigma to 1 / sqrt(2 * 36) = 12 %.
-_MIN_BLOCKS = 36
-# Rows of tiles from which a change of the shift over the rows can be told apart from noise.
-_MIN_SHEAR_ROWS = 6
-# Rows of tiles per cosine mode down the frame: the higher ones are of rows that share smoothed noise.
-_ROWS_PER_MODE = 1.5
-# Sides of the squares of tiles that may move by themselves, and the chi-square (2 degrees of freedom) from which one
-# seems to: of some 500 independent squares, one in 20 images, in which it widens the covariance by little.
-_PULL_SIDES, _PULL_CHI2 = (2, 3, 4, 6, 8, 11), 18.4
-# The median of a chi-square, by how many times that the squares scatter where the images differ all over, as by
-# charging; more than that is that of motions. Part of the largest variance that is rounding.
-_MEDIAN_CHI2, _MOST_EXCESS, _ROUNDING = 1.386, 3.0, 1e-6
-# Part of the information that must be elsewhere: the specimen is no smaller part.
-_LEAST_REST = 0.3
-# A shear whose scaled information matrix has a larger condition number is not determined.
-_MAX_CONDITION = 1e6
-# Noise of lines is looked for from this number of rows of tiles on, and found where it makes the
-# variance this much larger; the ratio of two variances from 10 rows scatters by a factor of 1.6.
-_MIN_NOISE_ROWS = 10
-_ROWS_RATIO = 2.0
-# By how many standard deviations the common information must exceed what chance gives: once in a
-# million images of noise.
-_CHANCE = 5.0
 # A strained specimen, which has structure, has as little of it in common.
 _FEATURELESS = (
     "one direction is not determined (no more gradient in common than by chance):"
@@ -314,7 +288,7 @@ def _look_at_tiles(level: PyramidLevel, image: Pyramid, shift: Array) -> TileSta
     rich = tiles.reference >= median(tiles.reference)
     ratios = tiles.common[rich] / np.maximum(tiles.reference[rich], 1e-30)
     # What came in has nothing in common with what it covers.
-    ratios = ratios[ratios > _LEAST_GAIN]
+    ratios = ratios[ratios > GAIN_MIN]
     gains = np.full(tiles.gain.size, median(ratios) if len(ratios) else 1.0)
     return _make_statistics(level, window, sums, gains)
 
@@ -379,7 +353,7 @@ class _Comparison:
     @property
     def improved(self) -> Array:
         """The shift after the step, which is limited."""
-        limit = min(1.0, _MAX_STEP_PX / max(self.length, 1e-12))
+        limit = min(1.0, STEP_PX_MAX / max(self.length, 1e-12))
         return np.asarray(self.shift + limit * self.fit.step)
 
 
@@ -428,17 +402,17 @@ def _align(
     passes = 0
     for level in levels[:-1]:
         hessian = None
-        for _ in range(_MAX_COARSE_PASSES):
+        for _ in range(COARSE_PASSES_MAX):
             comparison = _compare(level, image, shift / level.factor, hessian, enough, held=held)
             if isinstance(comparison, Rejection):
                 # A fine texture may be lost at this resolution; the next one knows more.
                 break
             passes += 1
             shift, hessian = comparison.improved * level.factor, comparison.sums.hessian
-            if comparison.length < _COARSE_STEP_PX:
+            if comparison.length < COARSE_STEP_PX:
                 break
     hessian = None
-    for _ in range(_MAX_PASSES):
+    for _ in range(PASSES_MAX):
         comparison = _compare(
             levels[-1], image, shift / levels[-1].factor, hessian, enough, held=held
         )
@@ -447,7 +421,7 @@ def _align(
         passes += 1
         shift = comparison.improved * levels[-1].factor
         # Far from the right shift the gradients have less in common.
-        hessian = comparison.sums.hessian if comparison.length < _MAX_STEP_PX else None
+        hessian = comparison.sums.hessian if comparison.length < STEP_PX_MAX else None
         covariance = _covariance(comparison)
         converged = _has_converged(comparison, covariance)
         if converged:
@@ -461,8 +435,8 @@ def _align(
 def _has_converged(comparison: _Comparison, covariance: Array) -> bool:
     """Whether what remains after a step is little against the sigma of the shift in its better direction."""
     sigma = float(np.sqrt(max(np.min(np.linalg.eigvalsh(covariance)), 0.0)))
-    remaining = _CONTRACTION * comparison.length + _CURVATURE * comparison.length**2
-    return remaining < max(_TOLERATED_SIGMAS * sigma, _MIN_TOLERANCE_PX)
+    remaining = CONTRACTION * comparison.length + CURVATURE * comparison.length**2
+    return remaining < max(REMAINING_SIGMAS * sigma, REMAINING_PX)
 
 
 def align_reweighted(
@@ -504,9 +478,9 @@ def align_reweighted(
     first = _look_at_tiles(level, image, shift / level.factor) if looks else None
     if first is not None:
         found = reweight(first)
-        if np.count_nonzero(found) >= _MIN_BLOCKS:
+        if np.count_nonzero(found) >= BLOCKS_MIN:
             weights[first.rows, first.cols] = found
-    for passes in range(1, _MAX_PASSES + 1):
+    for passes in range(1, PASSES_MAX + 1):
         comparison = _compare(level, image, shift / level.factor, None, ALL_PIXELS, weights, noise)
         if isinstance(comparison, Rejection):
             return comparison
@@ -514,7 +488,7 @@ def align_reweighted(
         found = reweight(statistics)
         shift = comparison.improved * level.factor
         before = weights[statistics.rows, statistics.cols]
-        if passes >= min(_MAX_REWEIGHTED, _MAX_PASSES) or np.array_equal(found, before):
+        if passes >= min(REWEIGHTED_PASSES_MAX, PASSES_MAX) or np.array_equal(found, before):
             covariance = _covariance(comparison)
             converged = _has_converged(comparison, covariance)
             if converged:
@@ -573,7 +547,7 @@ def _find_chance_gradient(
     # Smoothed noise has fewer independent pixels.
     chance = np.sqrt(shared_pixels(level.sigma_px) / pixels)
     values, vectors = np.linalg.eigh(information)
-    by_chance = _CHANCE * chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
+    by_chance = CHANCE_SIGMAS * chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
     if values[0] > by_chance[0]:
         return None
     if values[1] > by_chance[1]:
@@ -588,9 +562,9 @@ def _sum_blocks(comparison: _Comparison, scores: Array) -> Array:
     level = comparison.level
     rows = comparison.window.rows.stop - comparison.window.rows.start
     cols = comparison.window.cols.stop - comparison.window.cols.start
-    wanted = _BLOCK_SIGMAS * level.sigma_px
+    wanted = BLOCK_SIGMAS * level.sigma_px
     merge = [max(1, int(np.ceil(wanted / side))) for side in level.side]
-    while (rows // merge[1]) * (cols // merge[0]) < _MIN_BLOCKS and max(merge) > 1:
+    while (rows // merge[1]) * (cols // merge[0]) < BLOCKS_MIN and max(merge) > 1:
         merge = [max(1, m - 1) for m in merge]
     if max(merge) == 1:
         return scores
@@ -620,17 +594,17 @@ def _robust_covariance(
     blocks = _sum_blocks(comparison, scores)
     covariance = _sandwich_covariance(blocks, inverse)
     count = _count_scores(blocks, inverse)
-    if count < _FEW_SCORES:
+    if count < FEW_SCORES:
         expected = inverse @ _expect_spread(comparison, powers) @ inverse.T
-        covariance = (count * covariance + _EXPECTED_SCORES * expected) / (count + _EXPECTED_SCORES)
-        covariance *= _widen_few(count + _EXPECTED_SCORES, blocks.shape[1], len(blocks))
+        covariance = (count * covariance + EXPECTED_SCORES * expected) / (count + EXPECTED_SCORES)
+        covariance *= _widen_few(count + EXPECTED_SCORES, blocks.shape[1], len(blocks))
     cols = comparison.window.cols.stop - comparison.window.cols.start
     rows = scores.reshape(-1, cols, scores.shape[1]).sum(axis=1)
-    if len(rows) < _MIN_NOISE_ROWS:
+    if len(rows) < NOISE_ROWS_MIN:
         return covariance
     ratio = np.diag(_sandwich_covariance(rows, inverse)) / np.maximum(np.diag(covariance), 1e-300)
     # With few rows the ratio scatters; white noise seldom makes it so large.
-    scale = np.sqrt(np.where(ratio > _ROWS_RATIO, ratio, 1.0))
+    scale = np.sqrt(np.where(ratio > ROWS_RATIO_MIN, ratio, 1.0))
     return np.asarray(covariance * np.outer(scale, scale))
 
 
@@ -673,9 +647,9 @@ def _widen_few(count: float, estimated: int, blocks: int) -> float:
 
     Three sigmas then hold as of a Gaussian, although the sigma is that of few scores (Student's t).
     """
-    freedom = max(count - estimated, _LEAST_FREEDOM)
+    freedom = max(count - estimated, FREEDOM_MIN)
     few = estimated / freedom - estimated / max(blocks, 1)
-    return (float(stdtrit(freedom, _THREE_SIGMAS)) / 3.0) ** 2 * (1.0 + max(few, 0.0))
+    return (float(stdtrit(freedom, THREE_SIGMAS)) / 3.0) ** 2 * (1.0 + max(few, 0.0))
 
 
 def _summarise(
@@ -775,7 +749,7 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, A
     whole = (by_row.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scaled, scale = equilibrate(information)
-    if rows < _MIN_SHEAR_ROWS or not _well_conditioned(scaled):
+    if rows < SHEAR_ROWS_MIN or not _well_conditioned(scaled):
         return np.full(4, np.nan), np.full((4, 4), np.inf), comparison.fit.scores
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = comparison.fit.scores.reshape(rows, cols, 2)
@@ -806,7 +780,7 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     ]
     planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
     # Of a specimen that turns, the halves differ.
-    sides = [n for n in _PULL_SIDES if 2 * n <= min(rows, cols)] or [_PULL_SIDES[0]]
+    sides = [n for n in PULL_SIDES if 2 * n <= min(rows, cols)] or [PULL_SIDES[0]]
     squares = [
         cv2.boxFilter(planes, -1, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
         for n in sides
@@ -815,14 +789,14 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     chi2 = _chi_squares(np.ascontiguousarray(sums[:5]))
     # Images are never quite alike: as the least squares scatter, so do larger ones.
     least = chi2[0][chi2[0] > 0.0]
-    scatter = median(least) / _MEDIAN_CHI2 if least.size else 1.0
-    moves = sums[:, chi2 > _PULL_CHI2 * min(max(scatter, 1.0), _MOST_EXCESS)].T
+    scatter = median(least) / MEDIAN_CHI2 if least.size else 1.0
+    moves = sums[:, chi2 > PULL_CHI2_MIN * min(max(scatter, 1.0), PULL_EXCESS_MAX)].T
     if not len(moves):
         return np.zeros(2)
     whole = comparison.fit.information
     rest = whole - moves[:, [5, 6, 6, 7]].reshape(-1, 2, 2)
     share = 0.5 * np.einsum("ij,nij->n", invert_symmetric(whole), rest)
-    found = share > _LEAST_REST
+    found = share > PULL_REST_MIN
     if not np.any(found):
         return np.zeros(2)
     pulls = np.linalg.solve(rest[found], moves[found, :2, None])[..., 0]
@@ -836,8 +810,8 @@ def _chi_squares(sums: Array) -> Array:
     x, y, xx, xy, yy = sums
     determinant = xx * yy - xy**2
     # Of what the filter adds up and takes off again, rounding is left where there is nothing.
-    least = _ROUNDING * (xx.max(axis=1) * yy.max(axis=1))[:, None]
-    good = determinant > np.maximum(_ROUNDING * xx * yy, least)
+    least = ROUNDING * (xx.max(axis=1) * yy.max(axis=1))[:, None]
+    good = determinant > np.maximum(ROUNDING * xx * yy, least)
     chi2 = (yy * x**2 - 2.0 * xy * x * y + xx * y**2) / np.where(good, determinant, 1.0)
     return np.where(good, chi2, 0.0)
 
@@ -845,14 +819,14 @@ def _chi_squares(sums: Array) -> Array:
 def _well_conditioned(matrix: Array) -> bool:
     """Whether the eigenvalues of a symmetric matrix are not too different."""
     values = np.abs(np.linalg.eigvalsh(matrix))
-    return bool(values.max() <= _MAX_CONDITION * values.min())
+    return bool(values.max() <= CONDITION_MAX * values.min())
 
 
 def _measure_row_power(comparison: _Comparison, modes: int) -> Array | None:
     """Power of the sum of both halves of the columns, and of their difference, which has the same noise."""
     rows, cols = len(comparison.window.y), len(comparison.window.x)
-    modes = min(modes, int(rows / _ROWS_PER_MODE))
-    if min(modes, cols) < _MIN_SHEAR_ROWS:
+    modes = min(modes, int(rows / ROWS_PER_MODE))
+    if min(modes, cols) < SHEAR_ROWS_MIN:
         return None
     scores = comparison.fit.scores.reshape(rows, cols, 2)
     # Neighbours share noise; pairs of columns take turns.
@@ -876,7 +850,7 @@ def _cosines(rows: int, modes: int) -> Array:
 def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     """The shift of the image's middle, shear, rotation and scale."""
     window, factor = comparison.window, comparison.level.factor
-    if min(len(window.x), len(window.y)) < _MIN_SHEAR_ROWS:
+    if min(len(window.x), len(window.y)) < SHEAR_ROWS_MIN:
         return None
     width, height = (factor * n for n in comparison.image_size)
     weights = _tile_information(comparison)

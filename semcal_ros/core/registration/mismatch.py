@@ -28,18 +28,16 @@ from semcal_ros.core.registration.normalised_correlation import (
     find_coarse_peaks,
     remove_shading,
 )
+from semcal_ros.core.registration.thresholds import (
+    DEFORMATION_MIN,
+    PART_CORRELATION_MIN,
+    PART_DEVIATION_PX_MAX,
+    PART_LEAD_MIN,
+    PARTS,
+    PARTS_FOUND_MIN,
+    PARTS_SIDE_PX_MAX,
+)
 from semcal_ros.core.registration.tiles import Pyramid
-
-# Longest side at which parts are compared: a part is then 64 px and more of most images.
-_LONGEST_PX = 256
-# Parts per side, and how many must be found for a pattern: two thirds, so that a row may be missing.
-_PARTS, _ENOUGH_PARTS = 3, 6
-# A part counts where its correlation is this high, and this much above that of any other place: the
-# correlation of 60 x 60 px of independent noise scatters by 1/60.
-_MIN_CORRELATION, _MIN_LEAD = 0.4, 0.1
-# Deviations of parts from one linear map, px of the reduced image, and the least deformation that is
-# none by chance: a px over the 170 px between the outer parts.
-_MAX_DEVIATION_PX, _MIN_DEFORMATION = 1.5, 0.01
 
 
 def explain_mismatch(reference: CoarseReference, image: Pyramid, guess_px: Array) -> str:
@@ -62,20 +60,20 @@ def explain_mismatch(reference: CoarseReference, image: Pyramid, guess_px: Array
 def explain_deformation(reference: Pyramid, image: Pyramid) -> str:
     """Say how one image is strained or turned against another, in words; empty where it is not."""
     longest = max(*reference.full.shape, *image.full.shape)
-    factor = 1 << max(0, int(np.ceil(np.log2(longest / _LONGEST_PX))))
+    factor = 1 << max(0, int(np.ceil(np.log2(longest / PARTS_SIDE_PX_MAX))))
     whole, moved = (remove_shading(pyramid.at(factor)) for pyramid in (reference, image))
     places, shifts = _match_parts(whole, moved)
-    if len(places) < _ENOUGH_PARTS:
+    if len(places) < PARTS_FOUND_MIN:
         return ""
     design = np.column_stack([places, np.ones(len(places))])
     found, *_ = np.linalg.lstsq(design, shifts, rcond=None)
-    if np.sqrt(np.mean((shifts - design @ found) ** 2)) > _MAX_DEVIATION_PX:
+    if np.sqrt(np.mean((shifts - design @ found) ** 2)) > PART_DEVIATION_PX_MAX:
         return ""
     gradient = found[:2].T
     turn = 0.5 * (gradient[1, 0] - gradient[0, 1])
     strain = 0.5 * (gradient + gradient.T)
     stretch = float(np.max(np.abs(np.linalg.eigvalsh(strain))))
-    if max(stretch, abs(turn)) < _MIN_DEFORMATION:
+    if max(stretch, abs(turn)) < DEFORMATION_MIN:
         return ""
     if abs(turn) > stretch:
         return f"turned by {np.degrees(turn):.1f} degrees: its parts fit, but not by one shift"
@@ -84,12 +82,12 @@ def explain_deformation(reference: Pyramid, image: Pyramid) -> str:
 
 def _match_parts(whole: Image, moved: Image) -> tuple[Array, Array]:
     """Middles (n, 2) of the parts of an image that are found elsewhere in the other, and their shifts (n, 2)."""
-    height, width = (n // _PARTS for n in moved.shape)
+    height, width = (n // PARTS for n in moved.shape)
     places, shifts = [], []
     if min(height, width) < 8 or height > whole.shape[0] or width > whole.shape[1]:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    for row in range(_PARTS):
-        for column in range(_PARTS):
+    for row in range(PARTS):
+        for column in range(PARTS):
             x, y = column * width, row * height
             part = moved[y : y + height, x : x + width]
             if float(part.std()) == 0.0:
@@ -102,7 +100,7 @@ def _match_parts(whole: Image, moved: Image) -> tuple[Array, Array]:
                 max(found_x - width // 4, 0) : found_x + width // 4 + 1,
             ]
             surface[around] = -1.0
-            if best > _MIN_CORRELATION and best - float(surface.max()) > _MIN_LEAD:
+            if best > PART_CORRELATION_MIN and best - float(surface.max()) > PART_LEAD_MIN:
                 places.append([x + 0.5 * width, y + 0.5 * height])
                 shifts.append([x - found_x, y - found_y])
     return np.array(places, dtype=np.float64).reshape(-1, 2), np.array(

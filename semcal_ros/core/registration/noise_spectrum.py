@@ -34,25 +34,18 @@ import numpy as np
 import scipy.fft
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
-
-# Parts of the image, from its middle, whose spectrum is measured. 256 px tell the smoothing; the
-# corners of the spectrum of 64 px have some 300 coefficients, which tell the noise to 8 %.
-_CROP_PX = 256
-_NOISE_CROP_PX = 64
-# Side of the parts of a sparse image, and how many of them count.
-_PART_PX, _RICHEST = 32, 4
-# Rings of the spectrum, out to its corners.
-_BINS = 48
-# Widths of the Gaussian to choose from: in steps of 12 %, over which the variance is flat.
-_SIGMAS_PX = np.concatenate([[0.0], np.geomspace(0.4, 3.2, 19)])
-# The noise is what is found beyond this part of the Nyquist frequency, in the corners.
-_NOISE_BAND = 0.9
-# Frequencies of the spectrum of a smoothing, more than it has taps.
-_FREQUENCIES = 256
-# A ring holds signal where it exceeds the noise by this many standard errors.
-_SIGNAL_SIGMAS = 2.0
-# The Gaussian is cut off where it has 0.2 % of its height.
-_REACH_SIGMAS = 3.5
+from semcal_ros.core.registration.thresholds import (
+    GAUSSIAN_SIGMAS,
+    NOISE_BAND,
+    NOISE_SPECTRUM_PX,
+    RICH_PART_PX,
+    RICH_PARTS,
+    SIGNAL_SIGMAS,
+    SMOOTHING_FREQUENCIES,
+    SMOOTHINGS_PX,
+    SPECTRUM_PX,
+    SPECTRUM_RINGS,
+)
 
 
 @dataclass(frozen=True)
@@ -79,9 +72,11 @@ def _rings(rows: int, cols: int) -> tuple[Array, Indices, Array, Array]:
     """Window, ring of each coefficient, radial frequency (rad/px) and size of each ring."""
     window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(cols + 2)[1:-1])
     radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None, :])
-    ring = np.minimum((radius / np.sqrt(0.5) * _BINS).astype(int), _BINS - 1).ravel()
-    count = np.bincount(ring, minlength=_BINS).astype(np.float64)
-    middle = 2.0 * np.pi * np.sqrt(0.5) * (np.arange(_BINS) + 0.5) / _BINS
+    ring = np.minimum(
+        (radius / np.sqrt(0.5) * SPECTRUM_RINGS).astype(int), SPECTRUM_RINGS - 1
+    ).ravel()
+    count = np.bincount(ring, minlength=SPECTRUM_RINGS).astype(np.float64)
+    middle = 2.0 * np.pi * np.sqrt(0.5) * (np.arange(SPECTRUM_RINGS) + 0.5) / SPECTRUM_RINGS
     return window, ring, middle, count
 
 
@@ -91,7 +86,7 @@ def _corners(rows: int, cols: int) -> tuple[Array, Array, Indices, float]:
     energy.
     """
     window, ring, middle, _ = _rings(rows, cols)
-    corners = np.flatnonzero(middle[ring] > _NOISE_BAND * np.pi)
+    corners = np.flatnonzero(middle[ring] > NOISE_BAND * np.pi)
     return window, window / window.sum(), corners, float(np.sum(window**2))
 
 
@@ -108,20 +103,20 @@ def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array
     crop = (crop - float(np.sum(crop * window) / window.sum())) * window
     spectrum = scipy.fft.rfft2(crop).ravel()
     power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
-    total = np.bincount(ring, weights=power, minlength=_BINS)
+    total = np.bincount(ring, weights=power, minlength=SPECTRUM_RINGS)
     filled = count > 0
     return middle[filled], (total[filled] / count[filled]), count[filled]
 
 
 def _noise_floor(w: Array, power: Array, count: Array) -> float:
     """Mean power in the corners of the spectrum."""
-    corners = w > _NOISE_BAND * np.pi
+    corners = w > NOISE_BAND * np.pi
     return float(np.average(power[corners], weights=count[corners]))
 
 
 def estimate_noise_variance(image: AnyImage) -> float:
     """Variance of the white part of ``image`` per pixel, from its middle."""
-    crop = _cut_middle(image, _NOISE_CROP_PX)
+    crop = _cut_middle(image, NOISE_SPECTRUM_PX)
     # Of the spectrum, only its corners.
     window, weights, corners, energy = _corners(*crop.shape)
     crop = (crop - float(np.vdot(crop, weights))) * window
@@ -134,22 +129,22 @@ def measure_richest_parts(
 ) -> ImageStatistics:
     """The same as :func:`measure_image` of those parts of a sparse image that show most, put side by side."""
     height, width = image.shape
-    steps = [np.arange(0, n - _PART_PX + 1, _PART_PX // 2) for n in (height, width)]
+    steps = [np.arange(0, n - RICH_PART_PX + 1, RICH_PART_PX // 2) for n in (height, width)]
     places = [(int(y), int(x)) for y in steps[0] for x in steps[1]]
     small = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
-    variances = [float(small[y : y + _PART_PX, x : x + _PART_PX].var()) for y, x in places]
+    variances = [float(small[y : y + RICH_PART_PX, x : x + RICH_PART_PX].var()) for y, x in places]
     richest = [places[k] for k in np.argsort(variances)[::-1]]
     chosen: list[tuple[int, int]] = []
     for y, x in richest:
-        if all(max(abs(y - b), abs(x - a)) >= _PART_PX for b, a in chosen):
+        if all(max(abs(y - b), abs(x - a)) >= RICH_PART_PX for b, a in chosen):
             chosen.append((y, x))
-        if len(chosen) == _RICHEST:
+        if len(chosen) == RICH_PARTS:
             break
     found = [
         measure_image(
-            image[y : y + _PART_PX, x : x + _PART_PX],
+            image[y : y + RICH_PART_PX, x : x + RICH_PART_PX],
             averaged,
-            None if raw is None else raw[y : y + _PART_PX, x : x + _PART_PX],
+            None if raw is None else raw[y : y + RICH_PART_PX, x : x + RICH_PART_PX],
         )
         for y, x in chosen
     ]
@@ -179,7 +174,7 @@ def measure_image(
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; an image with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
-    w, power, count = _radial_spectrum(image, _CROP_PX)
+    w, power, count = _radial_spectrum(image, SPECTRUM_PX)
     noise = _noise_floor(w, power, count)
     signal = _find_signal(power, noise, count)
     signal_variance = float(np.sum(signal * count) / np.sum(count))
@@ -187,23 +182,23 @@ def measure_image(
         return ImageStatistics(noise, signal_variance, 0.0)
     white = noise
     if raw is not None:
-        white = max(noise, _noise_floor(*_radial_spectrum(raw, _CROP_PX)) / averaged)
+        white = max(noise, _noise_floor(*_radial_spectrum(raw, SPECTRUM_PX)) / averaged)
         signal = _find_signal(power, white, count)
         if not np.any(signal):
-            return ImageStatistics(noise, signal_variance, float(_SIGMAS_PX[-1]))
-    psi = np.exp(-np.outer(_SIGMAS_PX**2, w**2))
+            return ImageStatistics(noise, signal_variance, float(SMOOTHINGS_PX[-1]))
+    psi = np.exp(-np.outer(SMOOTHINGS_PX**2, w**2))
     single = white * averaged
     numerator = psi**2 @ (count * w**2 * ((white + single) * signal + white * single))
     denominator = psi @ (count * w**2 * signal)
     best = int(np.argmin(numerator / denominator**2))
-    return ImageStatistics(noise, signal_variance, float(_SIGMAS_PX[best]))
+    return ImageStatistics(noise, signal_variance, float(SMOOTHINGS_PX[best]))
 
 
 def _find_signal(power: Array, noise: float, count: Array) -> Array:
     """Power of each ring above white noise; zero where it is not clearly above."""
     # A ring's estimate scatters; what is not clearly above the noise is not signal.
     scatter = noise * np.sqrt(2.0 / count)
-    return np.where(power - noise > _SIGNAL_SIGMAS * scatter, power - noise, 0.0)
+    return np.where(power - noise > SIGNAL_SIGMAS * scatter, power - noise, 0.0)
 
 
 @lru_cache(maxsize=32)
@@ -211,7 +206,7 @@ def gaussian_taps(sigma_px: float) -> Array:
     """Odd number of weights of a Gaussian, summing to one; ``[1]`` for sigma 0."""
     if sigma_px <= 0.0:
         return np.array([1.0])
-    reach = max(1, int(np.ceil(_REACH_SIGMAS * sigma_px)))
+    reach = max(1, int(np.ceil(GAUSSIAN_SIGMAS * sigma_px)))
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
     return np.asarray(taps / taps.sum())
 
@@ -223,8 +218,8 @@ def passed_variance(sigma_px: float) -> float:
 
 def passed_gradient(sigma_px: float) -> float:
     """Variance, per px^2, of the gradient along each axis of white noise of variance one after :func:`smooth`."""
-    frequency = 2.0 * np.pi * np.fft.fftfreq(_FREQUENCIES)
-    power = np.abs(np.fft.fft(gaussian_taps(sigma_px), _FREQUENCIES)) ** 2
+    frequency = 2.0 * np.pi * np.fft.fftfreq(SMOOTHING_FREQUENCIES)
+    power = np.abs(np.fft.fft(gaussian_taps(sigma_px), SMOOTHING_FREQUENCIES)) ** 2
     return float(np.mean(frequency**2 * power) * np.mean(power))
 
 

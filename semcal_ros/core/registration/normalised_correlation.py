@@ -32,28 +32,20 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask, mad_sigma
 from semcal_ros.core.caches import LruCache
+from semcal_ros.core.registration.thresholds import (
+    OVERLAP_SAMPLES_MIN,
+    PEAK_CORRELATION_MIN,
+    PEAK_HEIGHT_MIN,
+    PEAK_SIGMAS,
+    PEAKS_MAX,
+    SEARCHED_PX,
+    SHADING_PARTS,
+    SURFACES_KEPT,
+)
 from semcal_ros.core.registration.tiles import Pyramid
 
-# Longest sides to which the images are reduced, tried one after the other: each step costs four
-# times as much, and textures with little structure left at one size may have it at the next.
-_LEVELS_PX = (128, 256, 512)
-# A maximum over some 10^4 shifts of unrelated images stays below about 5 robust deviations.
-_SIGNIFICANT = 7.0
-# On a lattice the whole surface oscillates, so that its spread says nothing; its height does.
-_MIN_CORRELATION = 0.5
-# Peaks lower than this fraction of the highest are left out; competitors must reach 0.7 of it.
-_MIN_HEIGHT = 0.5
-# The highest peaks, and the same number of those nearest to the prediction.
-_MAX_PEAKS = 8
-# Shading is what is broader than an eighth of the field; a blur by a 16th of it keeps that.
-_SHADING_PARTS = 16.0
 # A maximum is higher than what lies around it.
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
-# Fewer samples along an axis do not make a correlation.
-_MIN_SAMPLES = 4.0
-# Reductions times sizes of images for which the reference's part of a surface is kept: the sizes
-# differ with what the drift leaves of a frame.
-_KEPT_PARTS = 6
 
 
 @dataclass(frozen=True)
@@ -80,7 +72,7 @@ class CoarsePeak:
     @property
     def significant(self) -> bool:
         """Whether unrelated images are unlikely to give such a peak."""
-        return self.significance >= _SIGNIFICANT or self.correlation >= _MIN_CORRELATION
+        return self.significance >= PEAK_SIGMAS or self.correlation >= PEAK_CORRELATION_MIN
 
 
 @dataclass(frozen=True)
@@ -145,7 +137,7 @@ class CoarseReference:
     pyramid: Pyramid
     min_overlap: float
     _parts: LruCache[tuple[int, tuple[int, ...]], _ReferencePart | None] = field(
-        default_factory=lambda: LruCache(_KEPT_PARTS), repr=False, compare=False
+        default_factory=lambda: LruCache(SURFACES_KEPT), repr=False, compare=False
     )
 
     def part(self, factor: int, image_shape: tuple[int, ...]) -> _ReferencePart | None:
@@ -189,7 +181,7 @@ def find_coarse_peaks(
     """
     longest = max(*reference.pyramid.full.shape, *image.full.shape)
     best: list[CoarsePeak] = []
-    for level in _LEVELS_PX[-1:] if finest else _LEVELS_PX:
+    for level in SEARCHED_PX[-1:] if finest else SEARCHED_PX:
         factor = 1 << max(0, int(np.ceil(np.log2(longest / level))))
         peaks = _find_peaks_at(reference, image, factor, guess_px)
         if peaks and (not best or peaks[0].significance > best[0].significance):
@@ -202,7 +194,7 @@ def find_coarse_peaks(
 def remove_shading(image: AnyImage) -> Image:
     """Shading removed: only structure below an eighth of the field is compared."""
     small = np.asarray(image, dtype=np.float32)
-    sigma = max(small.shape) / _SHADING_PARTS
+    sigma = max(small.shape) / SHADING_PARTS
     # The shading is smooth: a sixteenth of the pixels tell it.
     tiny = cv2.resize(small, (0, 0), fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(tiny, (0, 0), 0.25 * sigma)
@@ -227,16 +219,16 @@ def _find_peaks_at(
     searched = score.take(geometry.sampled)
     spread = mad_sigma(searched - np.median(searched))
     local = cv2.dilate(score, _NEIGHBOURS) <= score
-    local &= score >= np.float32(_MIN_HEIGHT * top)
+    local &= score >= np.float32(PEAK_HEIGHT_MIN * top)
     rows, cols = np.divmod(np.flatnonzero(local), score.shape[1])
     highest = np.argsort(-score[rows, cols], kind="stable")
     origin = int(geometry.shift_x[0]), int(geometry.shift_y[0])
     distances = np.hypot(
         cols + origin[0] - guess_px[0] / factor, rows + origin[1] - guess_px[1] / factor
     )
-    nearest = np.argsort(distances, kind="stable")[:_MAX_PEAKS]
+    nearest = np.argsort(distances, kind="stable")[:PEAKS_MAX]
     # On a lattice the one near the prediction need not be among the highest.
-    keep = [k for rank, k in enumerate(highest) if rank < _MAX_PEAKS or k in nearest]
+    keep = [k for rank, k in enumerate(highest) if rank < PEAKS_MAX or k in nearest]
     peaks = []
     for row, col in zip(rows[keep], cols[keep], strict=True):
         fine_row, fine_col = _interpolate_vertex(score, int(row), int(col))
@@ -271,7 +263,7 @@ def _overlap_along_axis(n_reference: int, n_image: int, min_overlap: float) -> t
     shifts = np.arange(-(n_reference - 1), n_image)
     first = np.maximum(0, -shifts)
     last = np.minimum(n_reference, n_image - shifts)
-    keep = last - first >= max(_MIN_SAMPLES, min_overlap * min(n_reference, n_image))
+    keep = last - first >= max(OVERLAP_SAMPLES_MIN, min_overlap * min(n_reference, n_image))
     return shifts[keep], first[keep], last[keep]
 
 

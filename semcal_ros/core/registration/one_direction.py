@@ -36,20 +36,17 @@ from semcal_ros.core.registration.normalised_correlation import (
     CoarseReference,
     find_coarse_peaks,
 )
+from semcal_ros.core.registration.thresholds import (
+    HALVES_PX_MAX,
+    HALVES_SIGMAS,
+    HELD_SIGMA_PX,
+    LINES_MOVED,
+    LINES_POWER_MAX,
+    NOISE_POWER_MAX,
+    NOISE_POWER_SIGMA,
+    SAME_RIDGE_STEPS,
+)
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
-
-# Gradient power along the lines over that across, noise taken off, up to which they are lines: that of lines which run
-# within 10 degrees (1-sigma) of each other. The noise is known to a tenth, and has to be less than twice that across.
-_LINES, _NOISE, _MOST_NOISE = 0.03, 0.1, 2.0
-# Part of the shorter side by which the image is moved along its lines to tell their direction.
-_MOVED = 0.25
-# Peaks nearer than this across the lines, in samples of the coarse search, are the same ridge.
-_SAME_RIDGE = 3.0
-# 1-sigma along the lines, px: the shift there is the prediction. It is that of a measurement, so that what is not known
-# stays apart from what is; whoever uses it adds how far the prediction may be off.
-_HELD_SIGMA_PX = 1.0
-# How far halves may disagree: as of any shift.
-_HALVES_SIGMAS, _HALVES_TOLERANCE_PX = 5.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -88,10 +85,13 @@ def find_direction(
     whole = level.normal_matrices.reshape(-1, 4, 4).sum(axis=0)
     noise = noise_variance * passed_gradient(level.sigma_px) * float(whole[3, 3])
     values, vectors = np.linalg.eigh(whole[:2, :2] - noise * np.eye(2))
-    if noise > _MOST_NOISE * values[1] or values[0] > _LINES * values[1] + _NOISE * noise:
+    if (
+        noise > NOISE_POWER_MAX * values[1]
+        or values[0] > LINES_POWER_MAX * values[1] + NOISE_POWER_SIGMA * noise
+    ):
         return None
     across, along = vectors[:, 1], vectors[:, 0]
-    length = _MOVED * min(level.size)
+    length = LINES_MOVED * min(level.size)
     angles, variances = [], []
     for moved in (length, -length):
         found = align(levels, image, moved * along, held=along)
@@ -139,7 +139,7 @@ def align_across(
     offsets = [float((np.array(p.shift_px) - guess) @ lines.across) for p in peaks]
     least = min_competing_height * peaks[0].correlation
     for peak, offset in zip(peaks[1:], offsets[1:], strict=True):
-        if abs(offset - offsets[0]) > _SAME_RIDGE * peak.step_px and peak.correlation >= least:
+        if abs(offset - offsets[0]) > SAME_RIDGE_STEPS * peak.step_px and peak.correlation >= least:
             return Rejection(
                 MatchFailure.AMBIGUOUS,
                 f"ambiguous: shifts of {offsets[0]:.1f} and {offset:.1f} px across the lines explain the image "
@@ -156,7 +156,7 @@ def align_across(
     aside = float(lines.along @ guess_covariance @ lines.along)
     variance = float(lines.across @ found.covariance @ lines.across) + aside * lines.sigma_rad**2
     covariance = variance * np.outer(lines.across, lines.across)
-    covariance += _HELD_SIGMA_PX**2 * np.outer(lines.along, lines.along)
+    covariance += HELD_SIGMA_PX**2 * np.outer(lines.along, lines.along)
     # A shear is one of rows, of which a part shows.
     unknown = np.full(4, np.nan), np.full((4, 4), np.inf)
     alone = replace(
@@ -189,7 +189,7 @@ def _compare_halves(found: Alignment, lines: OneDirection) -> Rejection[MatchFai
             continue
         apart = abs(sums[0][0] / sums[0][1] - sums[1][0] / sums[1][1])
         sigma = np.sqrt(noise * sum(1.0 / weight for _, weight in sums))
-        if apart > _HALVES_SIGMAS * sigma + _HALVES_TOLERANCE_PX:
+        if apart > HALVES_SIGMAS * sigma + HALVES_PX_MAX:
             return Rejection(
                 MatchFailure.HALVES_DISAGREE,
                 f"halves of the image disagree by {apart:.1f} px across the lines",

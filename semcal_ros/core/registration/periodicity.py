@@ -35,32 +35,22 @@ from semcal_ros.core.registration.inverse_compositional import (
     tile_residual_energies,
 )
 from semcal_ros.core.registration.normalised_correlation import parabola_vertex, remove_shading
+from semcal_ros.core.registration.thresholds import (
+    COARSE_PERIOD_MIN,
+    DEFECT_EVIDENCE_MAX,
+    DEFECT_SIGMAS,
+    DIP_MAX,
+    EVIDENCE_MIN,
+    HALF_PERIOD_SIGMAS,
+    PERIOD_PX_MIN,
+    PERIODS_COMPARED_MAX,
+    PERIODS_REACH_SIGMAS,
+    PERIODS_SIDE_PX_MAX,
+    PERIODS_SINE_MIN,
+    REPEATED_MIN,
+    SAME_SHIFT_PX,
+)
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
-
-# Side of the part of an image in which periods are looked for.
-_CROP_PX = 512
-# Least period: what repeats faster is beyond the Nyquist limit of a scan that is sampled well.
-_LEAST_PERIOD_PX = 4.0
-# Part of the structure that repeats.
-_REPEATED = 0.6
-# How deep the autocorrelation falls on the way to a period, as a part of what repeats.
-_DIP = 0.7
-# Sine of the least angle between two periods.
-_LEAST_ANGLE = 0.3
-# Shifts that are compared at most: those nearest to the prediction.
-_MOST_COMPARED = 16
-# How far the prediction reaches, in standard deviations.
-_REACH = 4.0
-# A defect is a tile that one shift explains so many robust deviations better than another one: by chance, 1 in 10^6
-# tiles. The squares of the deviations must sum to the evidence: two such tiles.
-_DEFECT_SIGMAS, _EVIDENCE = 5.0, 60.0
-# Of a body of tiles that lie together, at most: two of them make the evidence. As much against it is a second motion.
-_OF_ONE = 30.0
-# Part of the image's shorter side from which on a period is coarse, and of how many standard deviations of the
-# prediction half a period must consist to be predicted.
-_COARSE, _PREDICTED_SIGMAS = 1.0 / 16.0, 5.0
-# Half a pixel tells one shift from another.
-_SAME_SHIFT_PX = 0.5
 
 
 def find_periods(image: Image, noise_variance: float) -> Array:
@@ -73,7 +63,7 @@ def find_periods(image: Image, noise_variance: float) -> Array:
     noise_variance
         Variance of its white noise.
     """
-    rows, cols = (min(n, _CROP_PX) for n in image.shape)
+    rows, cols = (min(n, PERIODS_SIDE_PX_MAX) for n in image.shape)
     top, left = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
     part = remove_shading(np.asarray(image[top : top + rows, left : left + cols]))
     part = part - part.mean()
@@ -98,7 +88,7 @@ def find_periods(image: Image, noise_variance: float) -> Array:
     first = peaks[0]
     for second in peaks[1:]:
         across = abs(first[0] * second[1] - first[1] * second[0])
-        if across > _LEAST_ANGLE * np.hypot(*first) * np.hypot(*second):
+        if across > PERIODS_SINE_MIN * np.hypot(*first) * np.hypot(*second):
             return np.array([first, second])
     return np.array([first])
 
@@ -106,7 +96,7 @@ def find_periods(image: Image, noise_variance: float) -> Array:
 def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
     """Lags at which the structure repeats, the shortest first."""
     inner = surface[1:-1, 1:-1]
-    is_peak = inner >= _REPEATED
+    is_peak = inner >= REPEATED_MIN
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             if dy or dx:
@@ -116,11 +106,11 @@ def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
     for row, col in zip(*np.nonzero(is_peak), strict=True):
         y, x = float(row + 1), float(col + 1 - wide)
         length = np.hypot(x, y)
-        if length < _LEAST_PERIOD_PX:
+        if length < PERIOD_PX_MIN:
             continue
         steps = np.linspace(0.0, 1.0, int(2 * length) + 1)[1:-1]
         way = surface[np.rint(steps * y).astype(int), np.rint(steps * x).astype(int) + wide]
-        if float(way.min()) > _DIP * surface[row + 1, col + 1]:
+        if float(way.min()) > DIP_MAX * surface[row + 1, col + 1]:
             continue
         found.append(
             (
@@ -131,13 +121,15 @@ def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
         )
     # Lags along the first row have their mirror image in it.
     mirrored = surface[0]
-    for col in range(wide + int(_LEAST_PERIOD_PX), len(mirrored) - 1):
+    for col in range(wide + int(PERIOD_PX_MIN), len(mirrored) - 1):
         x = float(col - wide)
-        if mirrored[col] < _REPEATED or mirrored[col] < max(mirrored[col - 1], mirrored[col + 1]):
+        if mirrored[col] < REPEATED_MIN or mirrored[col] < max(
+            mirrored[col - 1], mirrored[col + 1]
+        ):
             continue
         if mirrored[col] < max(surface[1, col - 1 : col + 2]):
             continue
-        if float(mirrored[wide + 1 : col].min()) <= _DIP * mirrored[col]:
+        if float(mirrored[wide + 1 : col].min()) <= DIP_MAX * mirrored[col]:
             found.append((x, x + parabola_vertex(*mirrored[col - 1 : col + 2]), 0.0))
     return [(x, y) for _, x, y in sorted(found)]
 
@@ -173,7 +165,7 @@ def choose_period(
         found = align(fine, pyramid, shift)
         if isinstance(found, Rejection) or not found.converged:
             continue
-        if any(np.max(np.abs(found.shift_px - a.shift_px)) < _SAME_SHIFT_PX for a, _ in compared):
+        if any(np.max(np.abs(found.shift_px - a.shift_px)) < SAME_SHIFT_PX for a, _ in compared):
             continue
         energies = tile_residual_energies(fine[0], pyramid, found.shift_px)
         if energies is not None:
@@ -214,10 +206,10 @@ def _find_predicted(
 ) -> tuple[Alignment, Array] | None:
     """The shift that a prediction tells; None where the lattice is fine, or the prediction not good enough."""
     shortest = float(np.min(np.hypot(*periods.T)))
-    if spread is None or shortest < _COARSE * min(size):
+    if spread is None or shortest < COARSE_PERIOD_MIN * min(size):
         return None
     sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
-    if _PREDICTED_SIGMAS * sigma > 0.5 * shortest:
+    if HALF_PERIOD_SIGMAS * sigma > 0.5 * shortest:
         return None
     distances = [float(np.hypot(*(a.shift_px - guess))) for a, _ in compared]
     nearest = int(np.argmin(distances))
@@ -243,14 +235,14 @@ def _list_shifts(
     distances = np.einsum("ni,ij,nj->n", left, np.linalg.inv(covariance), left)
     order = np.argsort(distances, kind="stable")
     # The nearest ones always compete: a jump by a period is what must not happen.
-    allowed = (distances[order] <= _REACH**2) | (np.arange(len(order)) < 9)
-    return found[order[allowed]][:_MOST_COMPARED]
+    allowed = (distances[order] <= PERIODS_REACH_SIGMAS**2) | (np.arange(len(order)) < 9)
+    return found[order[allowed]][:PERIODS_COMPARED_MAX]
 
 
 def _tells(first: Array, second: Array) -> bool:
     """Whether the defects are where the first of two shifts says, and none where the second does."""
     pro, contra = _weigh(first, second)
-    return pro >= _EVIDENCE and contra < _OF_ONE
+    return pro >= EVIDENCE_MIN and contra < DEFECT_EVIDENCE_MAX
 
 
 def _weigh(first: Array, second: Array) -> tuple[float, float]:
@@ -271,7 +263,7 @@ def _weigh(first: Array, second: Array) -> tuple[float, float]:
 
 def _count_defects(deviations: Array) -> float:
     """Sum of the squares of clear deviations above zero, of each body of tiles that of one defect at most."""
-    clear = deviations > _DEFECT_SIGMAS
+    clear = deviations > DEFECT_SIGMAS
     labels, bodies = cv2.connectedComponents(clear.astype(np.uint8), connectivity=8)
     sums = np.bincount(bodies.ravel(), weights=(deviations**2).ravel(), minlength=labels)
-    return float(np.minimum(sums[1:], _OF_ONE).sum())
+    return float(np.minimum(sums[1:], DEFECT_EVIDENCE_MAX).sum())

@@ -69,35 +69,21 @@ from semcal_ros.core.registration.specimen import (
     look_at_whole,
     refuse_unless_followed,
 )
+from semcal_ros.core.registration.thresholds import (
+    DROPPED_MAX,
+    DROPPED_WITHIN_PX,
+    FARTHER_PX,
+    LEVEL_PX_MIN,
+    PARTS_SIGNAL_MIN,
+    PULL_PX_MAX,
+    SATURATION_SAMPLES,
+    SIDE_PX_MIN,
+    SIGNAL_MIN,
+    SIGNAL_SHARE_MIN,
+    SPECIMEN_SHARE_MIN,
+    TEXTURE_PX_MIN,
+)
 from semcal_ros.core.registration.tiles import Pyramid, make_level
-
-# 48 px leave 36 px between the margins of the filters: 6 x 6 tiles of 6 px, from whose scatter the
-# covariance of the shift can just be told.
-_MIN_SIDE_PX = 48
-# Fewer pixels a side leave less than a coefficient to a ring of the spectrum.
-_MIN_TEXTURE_PX = 16
-# 160 px leave 24 tiles of the least side, 6 px, along each side; coarser levels would have fewer.
-_MIN_LEVEL_PX = 160
-# Saturation is counted in some 256 x 256 pixels, which tell its share to 0.2 %.
-_SATURATION_SAMPLES = 256
-# Variance of the structure over that of the noise; chance makes less of images of 96 px and more.
-_MIN_SIGNAL = 0.06
-# The same of the richest parts: those of 90 images of noise, 192 to 768 px, had 0.12 at most.
-_MIN_SIGNAL_OF_PARTS = 0.3
-# The variance of the structure is at least this part of the whole, however large the noise is
-# estimated: the correlation stays finite.
-_MIN_SIGNAL_SHARE = 0.02
-
-
-# Where an image that shows more than lines fits worse: beyond the width of any detail.
-_FARTHER_PX = 8.0
-# Fixed pixels are dropped at the predicted shift, and again at the one that was found where it is farther away.
-_MOST_DROPPED, _DROPPED_WITHIN_PX = 3, 1.0
-# Less than this of the structure agrees where images are of two motions, though no part was found to be one.
-_MUCH_AGREES = 0.85
-
-# A part that may pull by more is another motion, and not one that was not found.
-_MOST_PULL_PX = 2.0
 
 # How an image appears that fits part by part, but not by one shift. (That its halves disagree says it already.)
 _SIGNS_OF_DEFORMATION = frozenset(
@@ -213,11 +199,11 @@ def _crop(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:
 
 def _find_defect(gray: AnyImage, settings: RegistrationSettings) -> str:
     """Why an image alone cannot be registered, or an empty string."""
-    if min(gray.shape) < _MIN_SIDE_PX:
+    if min(gray.shape) < SIDE_PX_MIN:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     if gray.dtype.kind == "f" and not np.isfinite(np.sum(gray, dtype=np.float64)):
         return "values that are not finite"
-    stride = max(1, min(gray.shape) // _SATURATION_SAMPLES)
+    stride = max(1, min(gray.shape) // SATURATION_SAMPLES)
     some = np.ascontiguousarray(gray[::stride, ::stride])
     lowest, highest = some.min(), some.max()
     if lowest == highest:
@@ -274,14 +260,14 @@ def prepare_reference(
         averaged,
         None if before is None else _texture(before, inside, limits),
     )
-    if statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance:
+    if statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance:
         # A sparse specimen need not show anything there; the whole image decides.
         statistics = measure_image(gray, averaged, before)
-    is_sparse = statistics.signal_variance < _MIN_SIGNAL * statistics.noise_variance
+    is_sparse = statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance
     if is_sparse:
         # A few particles are a small part of the variance, and tell a shift as well as many.
         found = measure_richest_parts(gray, averaged, before)
-        if found.signal_variance < _MIN_SIGNAL_OF_PARTS * found.noise_variance:
+        if found.signal_variance < PARTS_SIGNAL_MIN * found.noise_variance:
             return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
         statistics = replace(found, noise_variance=statistics.noise_variance)
     levels = []
@@ -310,13 +296,13 @@ def _texture(gray: AnyImage, inside: Region, limits: RegistrationSettings) -> An
         return gray
     left, top, right, bottom = np.subtract(limits.texture_region, np.tile(inside[:2], 2))
     part = gray[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
-    return part if min(part.shape) >= _MIN_TEXTURE_PX else gray
+    return part if min(part.shape) >= TEXTURE_PX_MIN else gray
 
 
 def _reduction_factors(shape: tuple[int, ...]) -> tuple[int, ...]:
     """Reductions from the coarsest level to full resolution."""
     factor, factors = 1, [1]
-    while min(shape) // (2 * factor) >= _MIN_LEVEL_PX:
+    while min(shape) // (2 * factor) >= LEVEL_PX_MIN:
         factor *= 2
         factors.insert(0, factor)
     return tuple(factors)
@@ -408,7 +394,7 @@ def register(
         If the shape or type is not that of an image, or the region does not lie in it.
     """
     dropped_at = np.asarray(guess_px, dtype=np.float64)
-    for _ in range(_MOST_DROPPED):
+    for _ in range(DROPPED_MAX):
         part = drop_fixed_pixels(reference, fixed, image_region, dropped_at)
         found = _register(
             part,
@@ -420,7 +406,7 @@ def register(
             suspected=suspected,
         )
         away_px = np.abs(found.shift_px - dropped_at)
-        if part is reference or not np.any(away_px > _DROPPED_WITHIN_PX):
+        if part is reference or not np.any(away_px > DROPPED_WITHIN_PX):
             break
         dropped_at = found.shift_px
     reference = part
@@ -456,7 +442,7 @@ def _is_seen_along(
     here = tile_residual_energies(level, pyramid, shift, lines.along)
     farther = [
         tile_residual_energies(level, pyramid, shift + length * lines.along, lines.along)
-        for length in (-_FARTHER_PX, _FARTHER_PX)
+        for length in (-FARTHER_PX, FARTHER_PX)
     ]
     least = reference.settings.min_deviations
     return all(compare_residuals(here, there) > least for there in farther)
@@ -499,7 +485,7 @@ def _register_across(
     rejection = find_failure(
         limits, peak, replace(alignment, covariance=sigma2 * np.eye(2)), correlation, 0.0
     )
-    if rejection is None and whole is not None and whole.share < _MUCH_AGREES:
+    if rejection is None and whole is not None and whole.share < SPECIMEN_SHARE_MIN:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
     follow_px = limits.follow_px((np.shape(image)[1], np.shape(image)[0]), inside)
@@ -603,7 +589,7 @@ def _register(
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     if rejection is not None:
         rejection = _name_deformation(rejection, reference, pyramid)
-    elif kept is None and whole is not None and whole.share < _MUCH_AGREES:
+    elif kept is None and whole is not None and whole.share < SPECIMEN_SHARE_MIN:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
     if rejection is None:
@@ -635,7 +621,7 @@ def _allow_for_pull(
     """
     pulled = alignment.with_pull()
     sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(pulled.covariance))))
-    if sigma <= _MOST_PULL_PX:
+    if sigma <= PULL_PX_MAX:
         return pulled, None
     reason = (
         f"ambiguous: without a part of the structure, the shift is another one by {sigma:.1f} px"
@@ -691,7 +677,7 @@ def _measure_signals(reference: Reference, variance: float, alignment: Alignment
     noise = reference.noise_variance * passed
     image_noise = variance * passed
     whole, image_whole = alignment.reference_variance, alignment.image_variance
-    signal = max(whole - noise, _MIN_SIGNAL_SHARE * whole)
-    image_signal = max(image_whole - image_noise, _MIN_SIGNAL_SHARE * image_whole)
+    signal = max(whole - noise, SIGNAL_SHARE_MIN * whole)
+    image_signal = max(image_whole - image_noise, SIGNAL_SHARE_MIN * image_whole)
     correlation = alignment.common_covariance / np.sqrt(signal * image_signal)
     return _Signals(float(min(correlation, 1.0)), float(np.sqrt(image_signal / signal)))

@@ -45,19 +45,18 @@ from semcal_ros.core.registration.inverse_compositional import (
 from semcal_ros.core.registration.noise_spectrum import estimate_noise_variance
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
 from semcal_ros.core.registration.reference import Reference, Region
+from semcal_ros.core.registration.thresholds import (
+    HYPOTHESES_MAX,
+    MAJORITY_SHARE,
+    NEAR_CHI2_MAX,
+    NOISE_PATCHES,
+    PREDICTED_PX_MAX,
+    PREDICTED_SHARE_MIN,
+    SAME_SHIFT_PX,
+    SPECIMEN_SHARE_MIN,
+    WELL_PREDICTED_PX,
+)
 from semcal_ros.core.registration.tiles import Pyramid
-
-# Of a shift that is the specimen's by itself, and at least, with a prediction.
-_MOST_AGREES, _LEAST_SHARE = 0.85, 0.1
-_HALF = 0.5
-# 1-sigma of a prediction that leaves no place for two motions, px.
-_WELL_PREDICTED_PX = 1.0
-# Peaks that are tried, and 1-sigma up to which a prediction is a start of its own, px.
-_HYPOTHESES, _PREDICTED_PX = 3, 4.0
-# Shifts that are one, px, and the chi-square up to which one is that of the prediction (1 in 10^4).
-_SAME_SHIFT_PX, _NEAR_CHI2 = 0.5, 18.4
-# Places along each axis at which the noise is measured.
-_PATCHES = 3
 
 
 @dataclass(frozen=True)
@@ -107,9 +106,9 @@ def keep_specimen(
         level.sigma_px,
         noise,
     )
-    starts = [peak, *(p for p in peaks[:_HYPOTHESES] if p is not peak)]
+    starts = [peak, *(p for p in peaks[:HYPOTHESES_MAX] if p is not peak)]
     sigma = np.inf if spread is None else float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
-    if sigma < _PREDICTED_PX:
+    if sigma < PREDICTED_PX_MAX:
         x, y = guess.tolist()
         starts.insert(0, replace(peak, shift_px=(x, y), step_px=1.0 + 3.0 * sigma))
     if isinstance(alignment, Alignment) and alignment.converged:
@@ -118,7 +117,7 @@ def keep_specimen(
     found: list[_Hypothesis] = []
     for start in starts:
         if any(
-            np.max(np.abs(np.subtract(start.shift_px, h.alignment.shift_px))) < _SAME_SHIFT_PX
+            np.max(np.abs(np.subtract(start.shift_px, h.alignment.shift_px))) < SAME_SHIFT_PX
             for h in found
         ):
             continue
@@ -136,16 +135,16 @@ def keep_specimen(
             continue
         agreement = judge.latest
         assert agreement is not None
-        is_one = agreement.share >= _LEAST_SHARE and agreement.are_bodies
+        is_one = agreement.share >= PREDICTED_SHARE_MIN and agreement.are_bodies
         if is_one and not any(
-            np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < _SAME_SHIFT_PX for h in found
+            np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < SAME_SHIFT_PX for h in found
         ):
             found.append(_Hypothesis(tried, agreement, start))
             if follow_px is not None:
                 # Another one may be that of the part that is the specimen.
                 continue
             is_near = spread is not None and _is_near(tried, guess, spread)
-            if is_near and sigma < _WELL_PREDICTED_PX and agreement.share > _HALF:
+            if is_near and sigma < WELL_PREDICTED_PX and agreement.share > MAJORITY_SHARE:
                 # No other one can have as much.
                 break
     if not found:
@@ -210,7 +209,7 @@ def _choose_followed(
     """The shift with which a part of the image agrees."""
     shares = [_share_inside(h.alignment, h.agreement, reference, follow_px) for h in found]
     best = int(np.argmax(shares))
-    return found[best] if shares[best] > _MOST_AGREES else _not_followed(shares[best])
+    return found[best] if shares[best] > SPECIMEN_SHARE_MIN else _not_followed(shares[best])
 
 
 def refuse_unless_followed(
@@ -221,7 +220,7 @@ def refuse_unless_followed(
     share = 0.0
     if agreement is not None:
         share = _share_inside(alignment, agreement, reference, follow_px)
-    return None if share > _MOST_AGREES else _not_followed(share)
+    return None if share > SPECIMEN_SHARE_MIN else _not_followed(share)
 
 
 def _not_followed(share: float) -> Rejection[MatchFailure]:
@@ -257,11 +256,11 @@ def _choose_hypothesis(
     if spread is not None:
         near = [h for h in ordered if _is_near(h.alignment, guess, spread)]
         sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
-        if len(near) == 1 and sigma < _PREDICTED_PX:
+        if len(near) == 1 and sigma < PREDICTED_PX_MAX:
             return near[0]
     best = ordered[0]
     others = sum(h.agreement.share for h in ordered[1:])
-    if best.agreement.share > _MOST_AGREES and others < 0.5 * best.agreement.share:
+    if best.agreement.share > SPECIMEN_SHARE_MIN and others < 0.5 * best.agreement.share:
         return best
     return Rejection(
         MatchFailure.AMBIGUOUS,
@@ -272,8 +271,8 @@ def _choose_hypothesis(
 
 def _is_near(alignment: Alignment, guess: Array, spread: Array) -> bool:
     innovation = alignment.shift_px - guess
-    covariance = spread + alignment.covariance + np.eye(2) * _SAME_SHIFT_PX**2
-    return float(innovation @ np.linalg.solve(covariance, innovation)) <= _NEAR_CHI2
+    covariance = spread + alignment.covariance + np.eye(2) * SAME_SHIFT_PX**2
+    return float(innovation @ np.linalg.solve(covariance, innovation)) <= NEAR_CHI2_MAX
 
 
 def _moving_tiles(
@@ -296,11 +295,11 @@ def _estimate_least_noise(image: AnyImage) -> float:
     height, width = image.shape
     patches = [
         image[
-            row * height // _PATCHES : (row + 1) * height // _PATCHES,
-            col * width // _PATCHES : (col + 1) * width // _PATCHES,
+            row * height // NOISE_PATCHES : (row + 1) * height // NOISE_PATCHES,
+            col * width // NOISE_PATCHES : (col + 1) * width // NOISE_PATCHES,
         ]
-        for row in range(_PATCHES)
-        for col in range(_PATCHES)
+        for row in range(NOISE_PATCHES)
+        for col in range(NOISE_PATCHES)
     ]
     variances = sorted(estimate_noise_variance(patch) for patch in patches)
-    return variances[_PATCHES]
+    return variances[NOISE_PATCHES]

@@ -26,18 +26,14 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from semcal_ros.core.arrays import Array, invert_scaled
+from semcal_ros.core.registration.thresholds import (
+    DETERMINANT_MIN,
+    GAIN_RCOND,
+    GRADIENT_ENERGY_MIN,
+    HELD_INFORMATION,
+    RAMPS_KEPT,
+)
 from semcal_ros.core.registration.tiles import PyramidLevel, TileSums, TileWindow
-
-# Ramps of gain and offset that explain away more than half of the energy of the gradient that
-# constants leave are not used.
-_MIN_GRADIENT_ENERGY = 0.5
-# Sums of single-precision pixels are good to 1e-7 and no better: what is below is rounding.
-_RCOND = 1e-9
-_MIN_DETERMINANT = 1e-6
-# Information along a direction that is held, relative to that of the gradients: a step there is a hundredth.
-_HELD = 100.0
-# Numbers of tiles for which the ramps are kept: those of a few windows at each resolution.
-_MAX_SHAPES = 32
 
 
 @dataclass(frozen=True)
@@ -145,12 +141,12 @@ def _compute_geometry(
     with_ramps = _eliminate_gain_and_offset(normal_matrices, ramps, whole)
     constant = _eliminate_gain_and_offset(normal_matrices, ramps[:, :1], whole)
     lost = with_ramps.gradient_share**2 * energy < (
-        _MIN_GRADIENT_ENERGY * constant.gradient_share**2 * energy
+        GRADIENT_ENERGY_MIN * constant.gradient_share**2 * energy
     )
     return constant if np.any(lost) else with_ramps
 
 
-@lru_cache(maxsize=_MAX_SHAPES)
+@lru_cache(maxsize=RAMPS_KEPT)
 def _make_ramps(shape: tuple[int, int]) -> tuple[Array, Array]:
     """(n, 3) one, x and y of the tiles, from -1 to 1, and (n, 9) their products."""
     rows, cols = (np.linspace(-1.0, 1.0, count) for count in shape)
@@ -166,7 +162,7 @@ def _eliminate_gain_and_offset(normal_matrices: Array, ramps: Array, whole: Arra
     mixed = whole[:2, 0, 2:, :count].reshape(2, 2 * count)
     total = whole[:, 0, :, 0]
     plain = np.diag(total)[:2]
-    inverse = invert_scaled(normal, rcond=_RCOND)
+    inverse = invert_scaled(normal, rcond=GAIN_RCOND)
     projection = mixed @ inverse
     remaining = plain - np.sum(projection * mixed, axis=1)
     share = np.sqrt(np.maximum(remaining, 0.0) / np.maximum(plain, 1e-30))
@@ -180,7 +176,7 @@ def well_posed(matrix: Array) -> bool:
     the single-precision sums that it comes from.
     """
     a, b, c = float(matrix[0, 0]), float(matrix[0, 1]), float(matrix[1, 1])
-    return a > 0.0 and c > 0.0 and a * c - b * b > _MIN_DETERMINANT * a * c
+    return a > 0.0 and c > 0.0 and a * c - b * b > DETERMINANT_MIN * a * c
 
 
 def invert_symmetric(matrix: Array) -> Array:
@@ -199,7 +195,7 @@ def solve_step(geometry: TileGeometry, sums: TileSums, held: Array | None = None
     """
     information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
     if held is not None:
-        information = information + _HELD * np.trace(information) * np.outer(held, held)
+        information = information + HELD_INFORMATION * np.trace(information) * np.outer(held, held)
     if not well_posed(information):
         return None
     ramps, count = geometry.ramps, geometry.ramps.shape[1]

@@ -41,27 +41,18 @@ from semcal_ros.core.registration.fractional_delay import (
     sample_tiles,
 )
 from semcal_ros.core.registration.noise_spectrum import gaussian_taps, passed_variance, smooth
+from semcal_ros.core.registration.thresholds import (
+    ALL_PIXELS,
+    CURVATURES_KEPT,
+    HESSIAN_BANDS,
+    HESSIAN_PIXELS,
+    SHARP_PX,
+    TILES_MIN,
+    WINDOWS_KEPT,
+)
 
 if TYPE_CHECKING:
     from semcal_ros.core.registration.tile_least_squares import TileGeometry
-
-
-# Tiles along a side that leave something to compare after gain and offset follow ramps.
-_MIN_TILES = 3
-#: Number of pixels from which the Gauss-Newton Hessian is taken at most: their gradients tell it to
-#: 1 %, and the gradients of the image cost more than all other sums.
-HESSIAN_PIXELS = 12_000
-#: More than an image has.
-ALL_PIXELS = 2**62
-# They lie in bands at the top, in the middle and at the bottom of the overlap.
-_HESSIAN_BANDS = 3
-# Windows for which what does not depend on the image is kept: an image that is shifted by little to either side
-# along both axes loses a row or a column of tiles at either end, or none.
-_KEPT_WINDOWS = 9
-# The same of second derivatives, which are those of all columns: three of them take 1.7 MB at 512 px, 6.4 at 1536.
-_KEPT_CURVATURES = 3
-# Images that are smooth by less have structure beyond the band of the shorter filters.
-_SHARP_PX = 0.3
 
 
 @dataclass(frozen=True)
@@ -102,10 +93,10 @@ class PyramidLevel:
     undropped: PyramidLevel | None = field(default=None, repr=False, compare=False)
     #: Geometry of the latest windows, by their keys.
     geometries: LruCache[tuple[int, int, int, int], TileGeometry] = field(
-        default_factory=lambda: LruCache(_KEPT_WINDOWS), repr=False, compare=False
+        default_factory=lambda: LruCache(WINDOWS_KEPT), repr=False, compare=False
     )
     _curvatures: LruCache[tuple[object, ...], _Curvature] = field(
-        default_factory=lambda: LruCache(_KEPT_CURVATURES), repr=False, compare=False
+        default_factory=lambda: LruCache(CURVATURES_KEPT), repr=False, compare=False
     )
 
     @property
@@ -214,7 +205,7 @@ class _Curvature:
 
 def band_of(sigma_px: float) -> Band:
     """Return the filters for an image that was smoothed by ``sigma_px``."""
-    return SHARP if sigma_px < _SHARP_PX else FINE
+    return SHARP if sigma_px < SHARP_PX else FINE
 
 
 def _margin(sigma_px: float) -> int:
@@ -238,7 +229,7 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel |
     margin = _margin(sigma_px)
     height, width = image.shape
     inside = (width - 2 * margin, height - 2 * margin)
-    if min(inside) < _MIN_TILES * 6:
+    if min(inside) < TILES_MIN * 6:
         return None
     side_x, side_y = (_tile_side(n) for n in inside)
     cols, rows = inside[0] // side_x, inside[1] // side_y
@@ -292,7 +283,7 @@ def drop_pixels(level: PyramidLevel, dropped: Mask) -> PyramidLevel:
         normal_matrices=normal_matrices,
         dropped=tiles,
         undropped=level,
-        geometries=LruCache(_KEPT_WINDOWS),
+        geometries=LruCache(WINDOWS_KEPT),
     )
 
 
@@ -352,7 +343,7 @@ def tile_window(
         high = image_size[axis] - level.margin - 1 - np.ceil(shift[axis]) - origin
         first = max(0, int(np.ceil(low / side)))
         last = min(count, int(np.floor(high / side)))
-        if last - first < _MIN_TILES:
+        if last - first < TILES_MIN:
             return None
         ranges.append(slice(first, last))
         middle = origin + side * (np.arange(first, last) + 0.5) - 0.5 + shift[axis]
@@ -441,11 +432,11 @@ def _pick_rows(level: PyramidLevel, window: TileWindow, enough: int) -> tuple[In
     do not count, because their derivatives reach beyond it.
     """
     rows, band = len(window.y), band_of(level.sigma_px)
-    lines = -(-enough // (len(window.x) * level.side[0] * _HESSIAN_BANDS)) + 2 * band.reach
+    lines = -(-enough // (len(window.x) * level.side[0] * HESSIAN_BANDS)) + 2 * band.reach
     tall = -(-lines // level.side[1])
-    if tall * _HESSIAN_BANDS >= rows:
+    if tall * HESSIAN_BANDS >= rows:
         return np.arange(rows), 0
-    middles = rows * (2 * np.arange(_HESSIAN_BANDS) + 1) // (2 * _HESSIAN_BANDS)
+    middles = rows * (2 * np.arange(HESSIAN_BANDS) + 1) // (2 * HESSIAN_BANDS)
     return ((middles - tall // 2)[:, None] + np.arange(tall)).ravel(), band.reach
 
 
@@ -460,7 +451,7 @@ def _compute_curvature(
     slopes = np.ascontiguousarray(planes).reshape(2, count * side_y, across * side_x)
     if unused:
         # The bands lie one below the other; nothing that counts reaches from one to the next.
-        bands = slopes.reshape(2, _HESSIAN_BANDS, -1, across * side_x)
+        bands = slopes.reshape(2, HESSIAN_BANDS, -1, across * side_x)
         bands[:, :, :unused] = bands[:, :, -unused:] = 0.0
     energy = np.einsum("kic,kic->kc", slopes, slopes).reshape(2, across, side_x)
     xx, xy = gradients_transposed(slopes[0], band)

@@ -479,7 +479,7 @@ def test_shifts_that_cannot_be_refined_say_why(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_what_does_not_converge_is_not_called_featureless(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inverse_compositional, "_MAX_PASSES", 1)
+    monkeypatch.setattr(inverse_compositional, "PASSES_MAX", 1)
     for count in (1, 2):
         peaks = [CoarsePeak((5.0 + k, -2.0), 0.9, 20.0, 4.0) for k in range(count)]
         monkeypatch.setattr(register_module, "find_coarse_peaks", lambda *_, p=peaks, **__: p)

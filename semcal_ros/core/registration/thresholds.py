@@ -1,0 +1,677 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The numbers of registration, each with its source."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semcal_ros.core.thresholds import Table
+
+TABLE = Table()
+
+# A row takes three lines, and not one for each of its parts.
+# fmt: off
+
+# Believed shifts, in acceptance.py and one_direction.py
+
+STAGES_APART_PX_MAX = TABLE.stated(
+    "STAGES_APART_PX_MAX", 1.0, "px",
+    "By which the fine shift may be off the coarse one, beyond the sample of the surface that the vertex of a "
+    "parabola is good to: for textures whose reduced images alias.",
+)
+HALVES_SIGMAS = TABLE.derived(
+    "HALVES_SIGMAS", 5.0, "sigma",
+    "By which two halves of an image may differ by chance: along one axis, more is one in 1.7 million.",
+)
+HALVES_PX_MAX = TABLE.stated(
+    "HALVES_PX_MAX", 0.3, "px",
+    "By which they may differ, too, for distortion that is left in the images: a change of scale of 1 part in "
+    "1000 over the 300 px between the middles of halves of 600 px.",
+)
+SAME_SHIFT_PX = TABLE.stated(
+    "SAME_SHIFT_PX", 0.5, "px",
+    "Shifts that were refined to within this distance of each other are one.",
+)
+
+# Whether a reference and an image can be used, in register.py
+
+SIDE_PX_MIN = TABLE.derived(
+    "SIDE_PX_MIN", 48, "px",
+    "Of what is compared: 36 px are left between the margins of the filters, 6 x 6 tiles of 6 px, from whose "
+    "scatter the covariance of the shift can just be told.",
+)
+TEXTURE_PX_MIN = TABLE.stated(
+    "TEXTURE_PX_MIN", 16, "px",
+    "Side of the part in which noise and structure are measured: its spectrum has three coefficients to a ring.",
+)
+LEVEL_PX_MIN = TABLE.derived(
+    "LEVEL_PX_MIN", 160, "px",
+    "Of a reduced image: it leaves 24 tiles of the least side, 6 px, along each side between the margins of the "
+    "filters. Coarser levels would have fewer.",
+)
+SATURATION_SAMPLES = TABLE.cost(
+    "SATURATION_SAMPLES", 256, "px",
+    "Along a side, in which saturation is counted: they tell its share to 0.2 %.",
+)
+SIGNAL_MIN = TABLE.derived(
+    "SIGNAL_MIN", 0.06, "of the variance of the noise",
+    "Variance of the structure. Of images of noise, one in 50 of 96 px has more by chance, one in 200 of 128 px, and "
+    "none of 10 000 of 192 px and more.",
+)
+PARTS_SIGNAL_MIN = TABLE.derived(
+    "PARTS_SIGNAL_MIN", 0.3, "of the variance of the noise",
+    "The same of the richest parts: those of 1550 images of noise, 192 to 768 px, had 0.21 at most.",
+)
+SIGNAL_SHARE_MIN = TABLE.stated(
+    "SIGNAL_SHARE_MIN", 0.02, "of the whole variance",
+    "That the structure has, however large the noise is estimated: the correlation stays finite.",
+)
+FARTHER_PX = TABLE.stated(
+    "FARTHER_PX", 8.0, "px",
+    "Along lines, by which an image that shows more than lines fits worse: beyond the width of any detail.",
+)
+PULL_PX_MAX = TABLE.stated(
+    "PULL_PX_MAX", 2.0, "px",
+    "1-sigma of a shift with what a part may pull: one that may pull by more is another motion, and not one that "
+    "was not found.",
+)
+
+# Fixed pixels, in fixed_pixels.py and register.py
+
+SMEARED_PX = TABLE.derived(
+    "SMEARED_PX", 2, "px",
+    "Around fixed pixels that the filters of gradients and of interpolation spoil, beyond the smoothing: farther "
+    "out, those of smooth images have less than a twentieth of the squares of their weights.",
+)
+DROPPED_WITHIN_PX = TABLE.stated(
+    "DROPPED_WITHIN_PX", 1, "px",
+    "By which the shift at which fixed pixels are dropped may be off the one that is found; farther away they are "
+    "dropped again, there.",
+)
+DROPPED_MAX = TABLE.cost(
+    "DROPPED_MAX", 3, "shifts",
+    "At which they are dropped: the predicted one, and those that were found.",
+)
+
+# The specimen where not all moves with it, in specimen.py and register.py
+
+SPECIMEN_SHARE_MIN = TABLE.stated(
+    "SPECIMEN_SHARE_MIN", 0.85, "of the structure",
+    "That agrees with a shift which is the specimen's by itself. Where less does, images are of two motions, "
+    "though no part was found to be one.",
+)
+PREDICTED_SHARE_MIN = TABLE.stated(
+    "PREDICTED_SHARE_MIN", 0.1, "of the structure",
+    "That agrees with any shift that is tried; whether it is the specimen's, a prediction may say then.",
+)
+MAJORITY_SHARE = TABLE.derived(
+    "MAJORITY_SHARE", 0.5, "of the structure",
+    "Of which one shift at most can have more.",
+)
+WELL_PREDICTED_PX = TABLE.stated(
+    "WELL_PREDICTED_PX", 1.0, "px",
+    "1-sigma of a prediction that leaves no place for two motions.",
+)
+PREDICTED_PX_MAX = TABLE.stated(
+    "PREDICTED_PX_MAX", 4.0, "px",
+    "1-sigma up to which a prediction is a start of its own, and says which motion is the specimen's.",
+)
+HYPOTHESES_MAX = TABLE.cost(
+    "HYPOTHESES_MAX", 3, "peaks",
+    "Of the correlation from which a motion is looked for.",
+)
+NEAR_CHI2_MAX = TABLE.derived(
+    "NEAR_CHI2_MAX", 18.4, "chi-square, 2 degrees of freedom",
+    "Up to which a shift is the predicted one: beyond are one in 10^4, exp(-18.4 / 2).",
+)
+NOISE_PATCHES = TABLE.stated(
+    "NOISE_PATCHES", 3, "patches",
+    "Along each axis, in which the noise is measured.",
+)
+
+# Tiles that agree with a shift, in agreement.py
+
+MISSING_MAX = TABLE.stated(
+    "MISSING_MAX", 0.4, "of the structure",
+    "Of a tile that may be missing: contrast changes with charging, focus and contamination by some tenths over a "
+    "field.",
+)
+BESIDES_MAX = TABLE.stated(
+    "BESIDES_MAX", 0.6, "of the structure",
+    "Of a tile that may be there besides, for the same reason.",
+)
+AGREEMENT_SIGMAS = TABLE.derived(
+    "AGREEMENT_SIGMAS", 4.5, "sigma",
+    "Of the noise by which a tile must exceed that, or have a shift of its own: by chance once in 300 000 tiles "
+    "on one side, in 150 000 on both.",
+)
+TILE_SHIFT_PX_MAX = TABLE.stated(
+    "TILE_SHIFT_PX_MAX", 0.15, "px",
+    "Of a tile against the others, beyond the noise: distortion and interpolation leave some hundredths.",
+)
+SUSPECT_SIGMAS = TABLE.derived(
+    "SUSPECT_SIGMAS", 3.5, "sigma",
+    "From which a tile is looked at together with its neighbours: by chance one in 2100.",
+)
+BEST_TILES = TABLE.stated(
+    "BEST_TILES", 0.3, "of the tiles",
+    "That fit best: what they leave is noise, of which interpolation hides some from where it is measured.",
+)
+GAIN_MIN = TABLE.stated(
+    "GAIN_MIN", 0.3, "ratio of contrasts",
+    "Of a tile whose gain counts: less is that of another place, and what came in has nothing in common with what "
+    "it covers.",
+)
+GAIN_RATIO_MAX = TABLE.stated(
+    "GAIN_RATIO_MAX", 1.5, "of the median gain",
+    "To either side, within which the gain of the image may be: what came in must not say how bright the specimen "
+    "is.",
+)
+TELLING_TILES_MIN = TABLE.stated(
+    "TELLING_TILES_MIN", 12, "tiles",
+    "That tell a gain, or how a shift changes over the field; half as many tell what the tiles of a row share.",
+)
+TELLING_SIGMA_PX_MAX = TABLE.stated(
+    "TELLING_SIGMA_PX_MAX", 0.5, "px",
+    "1-sigma of the shift of a tile; one that is less certain says nothing by it.",
+)
+CHANGE_PRECISION = TABLE.stated(
+    "CHANGE_PRECISION", 1e-3, "1 / px^2",
+    "Prior of the terms of a shift that changes over the field, 1-sigma of 32 px about none: those that tiles in "
+    "a row leave open are none.",
+)
+STRETCH_PX_MAX = TABLE.derived(
+    "STRETCH_PX_MAX", HALVES_PX_MAX, "px",
+    "By which a shift may change from the middle of the rows to their ends, as halves of an image may disagree.",
+)
+COMPLETE_SHARE_MIN = TABLE.stated(
+    "COMPLETE_SHARE_MIN", 0.97, "of the structure",
+    "That agrees with a shift where all of the image moves by it.",
+)
+DISAGREEING_MAX = TABLE.stated(
+    "DISAGREEING_MAX", 0.05, "of the tiles",
+    "That may disagree before most of them must be in bodies.",
+)
+BODY_TILES_MIN = TABLE.stated(
+    "BODY_TILES_MIN", 4, "tiles",
+    "That make a body.",
+)
+MOVING_TILES_MIN = TABLE.stated(
+    "MOVING_TILES_MIN", 2, "tiles",
+    "Of a body that is said to move: one alone is chance, or a particle that blinks.",
+)
+STILL_SHIFT_PX_MIN = TABLE.stated(
+    "STILL_SHIFT_PX_MIN", 0.05, "px",
+    "Of a body where something moved in the image before: less of a shift is enough there.",
+)
+STILL_SIGMAS = TABLE.derived(
+    "STILL_SIGMAS", 3.0, "sigma",
+    "Of the mean of its tiles, beyond that: by chance one in 370 bodies along an axis.",
+)
+SHOWN_TILE_PX = TABLE.stated(
+    "SHOWN_TILE_PX", 8, "px",
+    "Side of the tiles into which pixels are gathered that are only to be shown.",
+)
+
+# Several peaks, in ambiguity.py
+
+RESIDUAL_DIFFERENCE_MIN = TABLE.stated(
+    "RESIDUAL_DIFFERENCE_MIN", 0.05, "of the residual",
+    "By which two shifts must differ to be told apart: below it, the error of the interpolation, which depends on "
+    "the fraction of the shift, decides instead of the specimen.",
+)
+CONTRADICTION_MIN = TABLE.stated(
+    "CONTRADICTION_MIN", 0.3, "of the residual",
+    "The same for an image to contradict a prediction: sharp lattices look a little different wherever their "
+    "pixels fall.",
+)
+PREDICTED_CHI2_MAX = TABLE.derived(
+    "PREDICTED_CHI2_MAX", 9.0, "chi-square, 2 degrees of freedom",
+    "Up to which a prediction covers a peak, three sigmas: it misses the right one once in 90 times, exp(-9 / 2).",
+)
+COMMON_TILES_MIN = TABLE.derived(
+    "COMMON_TILES_MIN", 16, "tiles",
+    "Over which a mean is compared: its standard error is right to a fifth, 1 / sqrt(2 * 15) = 18 %; of fewer it "
+    "is not.",
+)
+
+# Periodic specimens, in periodicity.py
+
+PERIODS_SIDE_PX_MAX = TABLE.cost(
+    "PERIODS_SIDE_PX_MAX", 512, "px",
+    "Side of the part of an image in which periods are looked for.",
+)
+PERIOD_PX_MIN = TABLE.stated(
+    "PERIOD_PX_MIN", 4.0, "px",
+    "What repeats faster is beyond the Nyquist limit of a scan that is sampled well.",
+)
+REPEATED_MIN = TABLE.stated(
+    "REPEATED_MIN", 0.6, "of the structure",
+    "That repeats.",
+)
+DIP_MAX = TABLE.stated(
+    "DIP_MAX", 0.7, "of what repeats",
+    "To which the autocorrelation falls on the way to a period.",
+)
+PERIODS_SINE_MIN = TABLE.derived(
+    "PERIODS_SINE_MIN", 0.3, "sine",
+    "Of the angle between two periods: 17 degrees.",
+)
+PERIODS_COMPARED_MAX = TABLE.cost(
+    "PERIODS_COMPARED_MAX", 16, "shifts",
+    "That are compared: those nearest to the prediction.",
+)
+PERIODS_REACH_SIGMAS = TABLE.derived(
+    "PERIODS_REACH_SIGMAS", 4.0, "sigma",
+    "Within which a shift is predicted: beyond are one in 3000, exp(-4^2 / 2).",
+)
+DEFECT_SIGMAS = TABLE.derived(
+    "DEFECT_SIGMAS", 5.0, "robust sigma",
+    "By which one shift explains a tile better than another one where it is a defect: by chance one in 1.7 "
+    "million tiles, on either side.",
+)
+DEFECT_EVIDENCE_MAX = TABLE.stated(
+    "DEFECT_EVIDENCE_MAX", 30.0, "squared sigmas",
+    "Of a body of tiles that lie together. As much against a shift is a second motion.",
+)
+EVIDENCE_MIN = TABLE.derived(
+    "EVIDENCE_MIN", 2.0 * DEFECT_EVIDENCE_MAX, "squared sigmas",
+    "That tells two shifts apart: two defects.",
+)
+COARSE_PERIOD_MIN = TABLE.stated(
+    "COARSE_PERIOD_MIN", 1.0 / 16.0, "of the shorter side",
+    "From which on a period is coarse.",
+)
+HALF_PERIOD_SIGMAS = TABLE.derived(
+    "HALF_PERIOD_SIGMAS", 5.0, "sigma",
+    "Of a prediction in half a period that is predicted: along an axis it is off by more once in 1.7 million "
+    "times.",
+)
+
+# Lines, in one_direction.py
+
+LINES_POWER_MAX = TABLE.derived(
+    "LINES_POWER_MAX", 0.03, "of the power across",
+    "Of the gradient along lines, noise taken off: that of lines which run within 10 degrees (1-sigma) of each "
+    "other, sin(10 degrees)^2.",
+)
+NOISE_POWER_SIGMA = TABLE.stated(
+    "NOISE_POWER_SIGMA", 0.1, "of its power",
+    "To which that of the noise is known.",
+)
+NOISE_POWER_MAX = TABLE.stated(
+    "NOISE_POWER_MAX", 2.0, "of the power across",
+    "Of the noise: more of it hides which way lines run.",
+)
+LINES_MOVED = TABLE.stated(
+    "LINES_MOVED", 0.25, "of the shorter side",
+    "By which an image is moved along its lines to tell their direction.",
+)
+SAME_RIDGE_STEPS = TABLE.stated(
+    "SAME_RIDGE_STEPS", 3.0, "samples of the coarse search",
+    "Peaks that are nearer than this to each other across the lines are of one ridge.",
+)
+HELD_SIGMA_PX = TABLE.defined(
+    "HELD_SIGMA_PX", 1.0, "px",
+    "1-sigma along the lines, where the shift is the prediction. It is that of a measurement, so that what is not "
+    "known stays apart from what is; whoever uses it adds how far the prediction may be off.",
+)
+
+# Search over all shifts, in normalised_correlation.py
+
+SEARCHED_PX = TABLE.cost(
+    "SEARCHED_PX", (128, 256, 512), "px",
+    "Longest sides to which images are reduced, tried one after the other: each step costs four times as much, "
+    "and textures with little structure left at one size may have it at the next.",
+)
+PEAK_SIGMAS = TABLE.derived(
+    "PEAK_SIGMAS", 7.0, "robust sigma",
+    "From which a peak is significant. A maximum over some 10^4 shifts of unrelated images stays below about 5, "
+    "which as many normal deviates exceed in one of 350 images; 7, in one of 80 million.",
+)
+PEAK_CORRELATION_MIN = TABLE.stated(
+    "PEAK_CORRELATION_MIN", 0.5, "correlation",
+    "From which it is, too: on a lattice the whole surface oscillates, so that its spread says nothing; its "
+    "height does.",
+)
+PEAK_HEIGHT_MIN = TABLE.stated(
+    "PEAK_HEIGHT_MIN", 0.5, "of the highest",
+    "Of peaks that are listed; competitors must reach 0.7 of it.",
+)
+PEAKS_MAX = TABLE.cost(
+    "PEAKS_MAX", 8, "peaks",
+    "The highest, and as many of those nearest to the prediction.",
+)
+SHADING_PARTS = TABLE.stated(
+    "SHADING_PARTS", 16.0, "parts of the field",
+    "The width of a blur that keeps shading, which is what is broader than an eighth of the field.",
+)
+OVERLAP_SAMPLES_MIN = TABLE.stated(
+    "OVERLAP_SAMPLES_MIN", 4.0, "samples",
+    "Along an axis; fewer do not make a correlation.",
+)
+SURFACES_KEPT = TABLE.cost(
+    "SURFACES_KEPT", 6, "parts of a surface",
+    "Of the reference, one for each reduction and each size of an image: sizes differ with what the drift leaves "
+    "of a frame.",
+)
+
+# Why images do not match, in mismatch.py
+
+PARTS_SIDE_PX_MAX = TABLE.cost(
+    "PARTS_SIDE_PX_MAX", 256, "px",
+    "Longest side at which parts are compared: a part is then 64 px and more of most images.",
+)
+PARTS = TABLE.stated(
+    "PARTS", 3, "parts",
+    "Along each side.",
+)
+PARTS_FOUND_MIN = TABLE.derived(
+    "PARTS_FOUND_MIN", PARTS * (PARTS - 1), "parts",
+    "That must be found for a pattern: one row may be missing.",
+)
+PART_CORRELATION_MIN = TABLE.stated(
+    "PART_CORRELATION_MIN", 0.4, "correlation",
+    "Of a part that counts: that of 60 x 60 px of independent noise scatters by 1/60.",
+)
+PART_LEAD_MIN = TABLE.stated(
+    "PART_LEAD_MIN", 0.1, "correlation",
+    "Of such a part above that of any other place: six times the scatter of noise.",
+)
+PART_DEVIATION_PX_MAX = TABLE.stated(
+    "PART_DEVIATION_PX_MAX", 1.5, "px of the reduced image",
+    "RMS of the parts about one linear map.",
+)
+DEFORMATION_MIN = TABLE.stated(
+    "DEFORMATION_MIN", 0.01, "rad, or strain",
+    "Rotation or strain that is none by chance, as a pixel over the 170 px between the outer parts may be.",
+)
+
+# Noise and smoothing, in noise_spectrum.py
+
+SPECTRUM_PX = TABLE.cost(
+    "SPECTRUM_PX", 256, "px",
+    "Side of the part of an image, from its middle, whose spectrum tells the smoothing.",
+)
+NOISE_SPECTRUM_PX = TABLE.cost(
+    "NOISE_SPECTRUM_PX", 64, "px",
+    "Side of the part whose spectrum tells the noise, to 7 %.",
+)
+RICH_PART_PX = TABLE.stated(
+    "RICH_PART_PX", 32, "px",
+    "Side of the parts of a sparse image.",
+)
+RICH_PARTS = TABLE.stated(
+    "RICH_PARTS", 4, "parts",
+    "Of a sparse image that count: those that show most.",
+)
+SPECTRUM_RINGS = TABLE.stated(
+    "SPECTRUM_RINGS", 48, "rings",
+    "Of the spectrum, out to its corners.",
+)
+SMOOTHINGS_PX = TABLE.stated(
+    "SMOOTHINGS_PX", np.concatenate([[0.0], np.geomspace(0.4, 3.2, 19)]), "px",
+    "Widths of the Gaussian to choose from: in steps of 12 %, over which the variance of a shift is flat.",
+)
+NOISE_BAND = TABLE.stated(
+    "NOISE_BAND", 0.9, "of the Nyquist frequency",
+    "Beyond which, in the corners of the spectrum, what is found is noise.",
+)
+SMOOTHING_FREQUENCIES = TABLE.cost(
+    "SMOOTHING_FREQUENCIES", 256, "frequencies",
+    "Of the spectrum of a smoothing, more than it has taps.",
+)
+SIGNAL_SIGMAS = TABLE.derived(
+    "SIGNAL_SIGMAS", 2.0, "standard errors",
+    "By which a ring exceeds the noise where it holds signal: one in 44 rings of noise does.",
+)
+GAUSSIAN_SIGMAS = TABLE.derived(
+    "GAUSSIAN_SIGMAS", 3.5, "sigma",
+    "At which the Gaussian is cut off: it has 0.2 % of its height there, exp(-3.5^2 / 2).",
+)
+
+# Filters, in fractional_delay.py
+
+FILTER_FREQUENCIES = TABLE.derived(
+    "FILTER_FREQUENCIES", 64, "frequencies",
+    "At which a filter of up to 16 taps is fitted: four times as many.",
+)
+FILTER_RIDGE = TABLE.stated(
+    "FILTER_RIDGE", 1e-9, "of the diagonal",
+    "Of the normal matrix, added to it: what lies outside the band is left free, and this keeps the weights small "
+    "there.",
+)
+FLAT_BELOW = TABLE.stated(
+    "FLAT_BELOW", 0.05, "(rad / px)^2",
+    "Squared frequency below which the power of an image is taken as constant.",
+)
+BAND_EDGES = TABLE.stated(
+    "BAND_EDGES", (0.72 * np.pi, 0.8 * np.pi), "rad / px",
+    "Up to which filters are accurate: for images that are smooth, and for sharp ones with little noise. A shift "
+    "is then wrong by 1.2 % of a wave at most.",
+)
+BAND_TAPS = TABLE.stated(
+    "BAND_TAPS", (12, 16), "weights",
+    "Of a fractional shift, of the same.",
+)
+
+# Tiles, in tiles.py
+
+TILES_MIN = TABLE.stated(
+    "TILES_MIN", 3, "tiles",
+    "Along a side that leave something to compare after gain and offset follow ramps.",
+)
+SHARP_PX = TABLE.stated(
+    "SHARP_PX", 0.3, "px",
+    "Smoothing below which images have structure beyond the band of the shorter filters.",
+)
+HESSIAN_PIXELS = TABLE.cost(
+    "HESSIAN_PIXELS", 12_000, "px",
+    "From which the Gauss-Newton Hessian is taken: their gradients tell it to 1 %, and the gradients of the image "
+    "cost more than all other sums.",
+)
+ALL_PIXELS = TABLE.defined(
+    "ALL_PIXELS", 2**62, "px",
+    "More than an image has.",
+)
+HESSIAN_BANDS = TABLE.stated(
+    "HESSIAN_BANDS", 3, "bands",
+    "In which they lie: at the top, in the middle and at the bottom of the overlap.",
+)
+WINDOWS_KEPT = TABLE.cost(
+    "WINDOWS_KEPT", 9, "windows",
+    "For which what does not depend on the image is kept: an image that is shifted by little to either side along "
+    "both axes loses a row or a column of tiles at either end, or none.",
+)
+CURVATURES_KEPT = TABLE.cost(
+    "CURVATURES_KEPT", 3, "windows",
+    "The same of second derivatives, which are those of all columns: three of them take 1.7 MB at 512 px, 6.4 at "
+    "1536.",
+)
+
+# Least squares over tiles, in tile_least_squares.py
+
+GRADIENT_ENERGY_MIN = TABLE.stated(
+    "GRADIENT_ENERGY_MIN", 0.5, "of the energy",
+    "Of the gradient that constants leave: ramps of gain and offset that explain away more than the rest are not "
+    "used.",
+)
+GAIN_RCOND = TABLE.stated(
+    "GAIN_RCOND", 1e-9, "of the largest eigenvalue",
+    "Below which an eigenvalue of the normal equations of gain and offset is rounding: sums of single-precision "
+    "pixels are good to 1e-7 and no better.",
+)
+DETERMINANT_MIN = TABLE.stated(
+    "DETERMINANT_MIN", 1e-6, "1",
+    "Scaled determinant of an information matrix, below which it is rounding, too.",
+)
+HELD_INFORMATION = TABLE.derived(
+    "HELD_INFORMATION", 100.0, "of that of the gradients",
+    "Along a direction that is held: a step there is a hundredth.",
+)
+RAMPS_KEPT = TABLE.cost(
+    "RAMPS_KEPT", 32, "numbers of tiles",
+    "For which the ramps are kept: those of a few windows at each resolution.",
+)
+
+# Fine alignment, in inverse_compositional.py
+
+PASSES_MAX = TABLE.cost(
+    "PASSES_MAX", 12, "passes",
+    "A start that needs more is outside of the range of convergence.",
+)
+COARSE_PASSES_MAX = TABLE.cost(
+    "COARSE_PASSES_MAX", 4, "passes",
+    "The same at each coarse level.",
+)
+REWEIGHTED_PASSES_MAX = TABLE.cost(
+    "REWEIGHTED_PASSES_MAX", 8, "passes",
+    "In which the weights of tiles may change.",
+)
+STEP_PX_MAX = TABLE.stated(
+    "STEP_PX_MAX", 1.5, "px",
+    "The gradient extrapolates over a pixel or two of a sharp image; longer steps may overshoot.",
+)
+COARSE_STEP_PX = TABLE.stated(
+    "COARSE_STEP_PX", 0.2, "px of the level",
+    "At which a coarse level is left: less than half a pixel of the next one.",
+)
+CONTRACTION = TABLE.stated(
+    "CONTRACTION", 0.06, "of a step",
+    "What remains after it at most, beside CURVATURE.",
+)
+CURVATURE = TABLE.stated(
+    "CURVATURE", 0.5, "1 / px",
+    "What remains of the square of a step: one over the images' finest structure.",
+)
+REMAINING_SIGMAS = TABLE.derived(
+    "REMAINING_SIGMAS", 0.12, "sigma",
+    "That may remain: it adds 0.7 % to the error of the shift, sqrt(1 + 0.12^2).",
+)
+REMAINING_PX = TABLE.stated(
+    "REMAINING_PX", 5e-4, "px",
+    "That may remain in any case: below, errors of interpolation rule.",
+)
+BLOCK_SIGMAS = TABLE.stated(
+    "BLOCK_SIGMAS", 14.0, "widths of the smoothing",
+    "Side of the blocks whose scores are independent: a Gaussian, applied to both images, correlates over some 4 "
+    "sigma to either side; blocks are over three times as large, so that little of their sums is shared.",
+)
+BLOCKS_MIN = TABLE.derived(
+    "BLOCKS_MIN", 36, "blocks",
+    "Whose scatter tells a sigma to 12 %, 1 / sqrt(2 * 36).",
+)
+FREEDOM_MIN = TABLE.stated(
+    "FREEDOM_MIN", 8.0, "degrees of freedom",
+    "Of few scores: the number of those that count is itself uncertain where it is small.",
+)
+FEW_SCORES = TABLE.stated(
+    "FEW_SCORES", 40.0, "scores",
+    "Fewer make up most of the information only where it lies in lone particles.",
+)
+EXPECTED_SCORES = TABLE.stated(
+    "EXPECTED_SCORES", 6.0, "scores",
+    "As which the covariance counts then that the residuals of the pixels lead to: what moves a particle as a "
+    "whole, such as a change of its shape, is seen by the scatter of the scores alone.",
+)
+THREE_SIGMAS = TABLE.derived(
+    "THREE_SIGMAS", 0.99865, "probability",
+    "Of a normal deviate below three sigmas.",
+)
+SHEAR_ROWS_MIN = TABLE.stated(
+    "SHEAR_ROWS_MIN", 6, "rows of tiles",
+    "From which a change of the shift over the rows can be told apart from noise.",
+)
+ROWS_PER_MODE = TABLE.stated(
+    "ROWS_PER_MODE", 1.5, "rows of tiles",
+    "Per cosine mode down the frame: the higher modes are of rows that share smoothed noise.",
+)
+CONDITION_MAX = TABLE.stated(
+    "CONDITION_MAX", 1e6, "condition number",
+    "Of a scaled information matrix; with a larger one a shear is not determined.",
+)
+NOISE_ROWS_MIN = TABLE.stated(
+    "NOISE_ROWS_MIN", 10, "rows of tiles",
+    "From which on noise of lines is looked for.",
+)
+ROWS_RATIO_MIN = TABLE.derived(
+    "ROWS_RATIO_MIN", 2.0, "ratio of variances",
+    "From which it is found: that of 10 rows of white noise scatters by a factor of 1.6, exp(sqrt(2 / 9)), and is "
+    "so large once in 28 times along an axis (chi-square with 9 degrees of freedom).",
+)
+CHANCE_SIGMAS = TABLE.derived(
+    "CHANCE_SIGMAS", 5.0, "sigma",
+    "By which the common information must exceed what chance gives: once in 3.5 million images of noise along an "
+    "axis.",
+)
+PULL_SIDES = TABLE.stated(
+    "PULL_SIDES", (2, 3, 4, 6, 8, 11), "tiles",
+    "Sides of the squares that may move by themselves.",
+)
+PULL_CHI2_MIN = TABLE.derived(
+    "PULL_CHI2_MIN", 18.4, "chi-square, 2 degrees of freedom",
+    "From which a square seems to move: of some 500 independent ones, one in 20 images, 500 exp(-18.4 / 2), in "
+    "which it widens the covariance by little.",
+)
+MEDIAN_CHI2 = TABLE.derived(
+    "MEDIAN_CHI2", 1.386, "chi-square, 2 degrees of freedom",
+    "The median: 2 log(2).",
+)
+PULL_EXCESS_MAX = TABLE.stated(
+    "PULL_EXCESS_MAX", 3.0, "of the expected variance",
+    "By which squares scatter where the images differ all over, as by charging; more than that is that of "
+    "motions.",
+)
+PULL_REST_MIN = TABLE.stated(
+    "PULL_REST_MIN", 0.3, "of the information",
+    "That must be elsewhere: the specimen is no smaller part.",
+)
+ROUNDING = TABLE.cost(
+    "ROUNDING", 1e-6, "of the largest variance",
+    "What of a sum is rounding; keeps chi-squares finite where there is nothing.",
+)
+
+# Affine alignment, in affine.py
+
+AFFINE_STEPS_MAX = TABLE.cost(
+    "AFFINE_STEPS_MAX", 200, "iterations",
+    "Of the maximisation of the correlation.",
+)
+AFFINE_CONVERGED = TABLE.stated(
+    "AFFINE_CONVERGED", 1e-8, "correlation",
+    "Increase in an iteration below which the maximisation has converged.",
+)
+AFFINE_SMOOTHED_PX = TABLE.stated(
+    "AFFINE_SMOOTHED_PX", 1.5, "px",
+    "Sigma of the Gaussian that both images are smoothed with: shot noise has no scale.",
+)
+AFFINE_CORRELATION_MIN = TABLE.stated(
+    "AFFINE_CORRELATION_MIN", 0.3, "correlation",
+    "Below which images do not show the same, or noise hides it; at the shift that the alignment starts from, "
+    "half of it.",
+)
+AFFINE_BORDER_PX = TABLE.stated(
+    "AFFINE_BORDER_PX", 8, "px",
+    "At the border, that are left out: interpolation and smoothing reach there.",
+)
+AFFINE_FLOOR_PX = TABLE.stated(
+    "AFFINE_FLOOR_PX", 0.02, "px",
+    "What interpolation leaves at the ends of the template, seen on noiseless textures.",
+)
+AFFINE_LAGS_PX = TABLE.stated(
+    "AFFINE_LAGS_PX", 8, "px",
+    "Up to which the correlation of the residuals is added up: that of white noise, smoothed so, is 0.1 % there.",
+)
