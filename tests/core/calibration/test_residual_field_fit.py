@@ -115,6 +115,7 @@ def test_auto_finds_what_no_term_describes(with_field):
     assert _model_error(without, WAVY) > 5.0 * _model_error(with_field, WAVY)
 
 
+@pytest.mark.long
 def test_what_is_left_is_the_noise(with_field):
     expected = NOISE_PX * np.sqrt(2.0)
     assert with_field.model.statistics["rms_px"] == pytest.approx(expected, rel=0.07)
@@ -123,6 +124,7 @@ def test_what_is_left_is_the_noise(with_field):
     assert not any("converge" in w or "residuals are" in w for w in with_field.warnings)
 
 
+@pytest.mark.long
 def test_the_field_leaves_the_rest_of_the_model_alone(with_field):
     field = with_field.model.residual
     for coefficients in field.coefficients:

@@ -156,7 +156,7 @@ def test_a_frame_that_may_be_pulled_is_no_part_of_a_mean() -> None:
     assert abs(float(np.mean(errors[8:]))) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_drawn_is_not_found_to_stay_once_more() -> None:
     frames, _, _ = draw(KINDS["data bar"], 100)
     tracker = DriftTracker()

@@ -52,8 +52,11 @@ def noisy_scene(name: str) -> AnyImage:
     return scene(name)[0][0]
 
 
-@pytest.mark.parametrize("name", ["gold", "fractal", "lattice", "scratches"])
-@pytest.mark.parametrize("phase_px", long_but(lambda phase: phase != 0.3, [-6.0, 0.3, 2.7]))
+@pytest.mark.parametrize(
+    "name",
+    long_but(lambda n: n in ("gold", "scratches"), ["gold", "fractal", "lattice", "scratches"]),
+)
+@pytest.mark.parametrize("phase_px", long_but(lambda phase: phase == -6.0, [-6.0, 0.3, 2.7]))
 def test_the_phase_is_right_within_its_sigma(name: str, phase_px: float) -> None:
     found = estimate_line_phase(shifted(noisy_scene(name), phase_px))
     assert found.sigma_px < 0.06
