@@ -180,7 +180,8 @@ def estimate_process_noise(
     time_constants
         Multiples of that time constant to choose from; 0 is a white acceleration.
     deviations
-        The density is the largest whose likelihood lies within so many standard deviations of the highest. A few
+        The density is the largest whose likelihood lies within so many standard deviations of the highest, but no
+        more than the guess unless the likeliest is: what shows to be more is known well enough. A few
         measurements are most likely with hardly any noise a good part of the time, and a filter that believes it
         follows a bent path by a straight line, at too small a sigma.
 
@@ -236,11 +237,11 @@ def _maximise_likelihood(
         # Minus twice the log likelihood rises by one at one deviation.
         still = float(found.fun) + deviations**2
         highest = DENSITY_LOG_RANGE[1]
+        larger = highest
         if cost(highest) > still:
-            likely = float(
+            larger = float(
                 brentq(lambda v: cost(v) - still, likely, highest, xtol=DENSITY_LOG_TOLERANCE)
             )
-        else:
-            # They tell no upper limit: the guess.
-            likely = max(likely, 0.0)
+        # What the measurements show to be more than the guess is known well enough.
+        likely = max(likely, min(larger, 0.0))
     return float(found.fun), with_density(likely)

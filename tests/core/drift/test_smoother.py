@@ -506,6 +506,20 @@ def test_one_deviation_more_than_the_likeliest_density_is_seldom_too_small() -> 
     assert np.mean(np.array(larger) > 0.0) > 0.6
 
 
+def test_what_shows_to_be_more_than_the_guess_is_not_taken_larger_still() -> None:
+    truth = ProcessNoise(0.16, 1.0)
+    for seed in range(4):
+        events, _ = simulated(np.random.default_rng(seed), np.arange(17.0), truth, 0.05)
+        likeliest, larger = (
+            estimate_process_noise(
+                initial_state(0.0), events, ProcessNoise(0.001, 1.0), (1.0,), deviations
+            )
+            for deviations in (0.0, 1.0)
+        )
+        assert likeliest.psd > 0.001
+        assert larger.psd == likeliest.psd
+
+
 def test_units_do_not_change_what_is_likely() -> None:
     found = []
     for unit in (1.0, 1e-9):
