@@ -85,11 +85,11 @@ def _rms(values: Iterable[float]) -> float:
 
 
 def ratios(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]]:
-    """RMS of error over sigma of each calibrated microscope, in pixels and in nm of the next visit."""
+    """RMS of error over sigma of each calibrated microscope, in pixels and in nm, both of the next visit."""
     calibrated = [o for o in outcomes if not o.raised]
     return (
-        [_rms(o.px_over_sigma) for o in calibrated],
-        [_rms(o.next_over_sigma.ravel()) for o in calibrated],
+        [_rms(o.next_px_over_sigma) for o in calibrated],
+        [_rms(o.next_nm_over_sigma.ravel()) for o in calibrated],
     )
 
 

@@ -76,6 +76,8 @@ class Outcome:
         What was printed during the calibration.
     error_px, sigma_px
         RMS distance of the points after a pose fit, and its stated 1-sigma.
+    px_next
+        The same distance in the next visit.
     nm_error, nm_sigma
         Relative errors of nm per pixel along x and y, and the stated sigmas.
     nm_next
@@ -95,6 +97,7 @@ class Outcome:
     between: tuple[float, ...] = ()
     error_px: tuple[float, ...] = ()
     sigma_px: tuple[float, ...] = ()
+    px_next: tuple[float, ...] = ()
     nm_error: tuple[tuple[float, float], ...] = ()
     nm_sigma: tuple[tuple[float, float], ...] = ()
     nm_next: tuple[tuple[float, float], ...] = ()
@@ -111,6 +114,7 @@ class Outcome:
 
     @property
     def px_over_sigma(self) -> Array:
+        """Against the mean of the microscope."""
         return np.array(self.error_px) / np.array(self.sigma_px)
 
     @property
@@ -119,7 +123,11 @@ class Outcome:
         return np.array(self.nm_error) / np.array(self.nm_sigma)
 
     @property
-    def next_over_sigma(self) -> Array:
+    def next_px_over_sigma(self) -> Array:
+        return np.array(self.px_next) / np.array(self.sigma_px)
+
+    @property
+    def next_nm_over_sigma(self) -> Array:
         return np.array(self.nm_next) / np.array(self.nm_sigma)
 
     @property
@@ -211,8 +219,8 @@ def score(own: Microscope, result: CalibrationResult) -> dict[str, object]:
     pixels, lengths, literal = [], [], []
     for g in own.between:
         camera = model.at(g)
-        pixels.append(compare_pixels(own, g, camera))
         visit = 1.0 + own.visit_sigma * rng.normal()
+        pixels.append(compare_pixels(own, g, camera, visit))
         height = LATER_HEIGHT_M * rng.normal()
         lengths.append(compare_lengths(own, g, camera, visit, height))
         if own.is_plain:
@@ -222,8 +230,9 @@ def score(own: Microscope, result: CalibrationResult) -> dict[str, object]:
             literal.append((float(off[0]), float(off[1])))
     return {
         "between": own.between,
-        "error_px": tuple(error for error, _ in pixels),
-        "sigma_px": tuple(sigma for _, sigma in pixels),
+        "error_px": tuple(error for error, _, _ in pixels),
+        "px_next": tuple(later for _, later, _ in pixels),
+        "sigma_px": tuple(sigma for _, _, sigma in pixels),
         "nm_error": tuple(error for error, _, _ in lengths),
         "nm_next": tuple(later for _, later, _ in lengths),
         "nm_sigma": tuple(sigma for _, _, sigma in lengths),
@@ -239,9 +248,11 @@ def score(own: Microscope, result: CalibrationResult) -> dict[str, object]:
 # -- pixels ----------------------------------------------------------------------------------------
 
 
-def compare_pixels(own: Microscope, g: float, camera: ScanCamera) -> tuple[float, float]:
-    """RMS over the planes of the distance after a pose fit, px, and its stated sigma."""
-    squares, spreads = [], []
+def compare_pixels(
+    own: Microscope, g: float, camera: ScanCamera, visit: float
+) -> tuple[float, float, float]:
+    """RMS over the planes of the distance after a pose fit, px: from the mean, and a visit; and the stated sigma."""
+    squares, later, spreads = [], [], []
     for tilt, axis in PLANES:
         board, rotation = _lattice(own, tilted(tilt, axis), g)
         points = board @ rotation.T
@@ -251,8 +262,14 @@ def compare_pixels(own: Microscope, g: float, camera: ScanCamera) -> tuple[float
         left, moves, at = fit_pose(camera.project, points, true)
         squares.append(np.mean(np.sum(left**2, axis=1)))
         spreads.append(_stated_square(camera, at, moves))
-    error, sigma = np.sqrt(np.mean(squares)), np.sqrt(np.mean(spreads))
-    return float(error if np.isfinite(error) else np.inf), float(sigma)
+        off, _, _ = fit_pose(camera.project, points, own.project(g, points, visit))
+        later.append(np.mean(np.sum(off**2, axis=1)))
+    error, next_one, sigma = (np.sqrt(np.mean(own)) for own in (squares, later, spreads))
+    return _finite(error), _finite(next_one), float(sigma)
+
+
+def _finite(error: float) -> float:
+    return float(error if np.isfinite(error) else np.inf)
 
 
 def _lattice(own: Microscope, rotation: Array, g: float) -> tuple[Array, Array]:
