@@ -20,23 +20,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from semcal_ros.core.arrays import solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine, variance_factor
 from semcal_ros.core.calibration.estimator.normal_equations import reduced_normal_equations
 from semcal_ros.core.calibration.estimator.poses import mirror, restart_poses, right_way_up
-from semcal_ros.core.calibration.estimator.posterior import estimate_changes
+from semcal_ros.core.calibration.estimator.posterior import estimate_changes, log_evidence
 from semcal_ros.core.calibration.estimator.problem import (
     Priors,
     Setup,
     build_problem,
 )
 from semcal_ros.core.calibration.estimator.residuals import corner_residuals
+from semcal_ros.core.calibration.estimator.thresholds import CHANGE_FALLS
 from semcal_ros.core.calibration.pipeline import fit_joint
 from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.start import measure_misfit_px
-from semcal_ros.core.camera.calibration_model import design_matrix, stack_coefficients
+from semcal_ros.core.camera.calibration_model import (
+    columns_of,
+    design_matrix,
+    stack_coefficients,
+)
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import grid_views
 
@@ -82,6 +89,43 @@ def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_
     # The covariance takes one Gauss-Newton step, the adjustment here goes to its end: they differ
     # by less than half a sigma.
     assert np.all(np.abs(added - change)[clear] < 0.5 * sigma[clear])
+
+
+def test_the_evidence_is_the_probability_of_the_data() -> None:
+    """Of a linear model with a normal prior that is a normal distribution, whatever point the equations start from."""
+    rng = np.random.default_rng(3)
+    design, mean, at = rng.normal(size=(12, 4)), rng.normal(size=4), rng.normal(size=4)
+    seen = rng.normal(size=12)
+    found, true = [], []
+    for sigma in (np.array([1.0, 0.5, 0.2, 0.1]), np.array([3.0, 1e-3, 2.0, 0.7])):
+        matrix = design.T @ design + np.diag(sigma**-2.0)
+        right = design.T @ (seen - design @ at) - (at - mean) / sigma**2
+        found.append(log_evidence(matrix, right, at - mean, sigma))
+        spread = np.eye(12) + design @ np.diag(sigma**2) @ design.T
+        true.append(multivariate_normal(design @ mean, spread).logpdf(seen))
+    assert np.diff(found) == pytest.approx(np.diff(true), rel=1e-9)
+
+
+@pytest.mark.parametrize("kink", [False, True], ids=["smooth", "kinked"])
+def test_changes_fall_as_quickly_as_those_of_the_microscope(kink: bool) -> None:
+    """Functions that are nearly straight leave less open between magnifications than those with a kink."""
+    magnifications = [100.0, 200.0, 400.0, 800.0, 1600.0, 3200.0]
+
+    def camera_at(g: float) -> ScanCamera:
+        camera = JSM.camera_at(g)
+        bend = abs(np.log2(g / 800.0)) if kink else 0.0
+        return replace(camera, aspect=1.0 + 2e-3 * bend, skew=1e-3 * bend, xi_r=3e-3 * (1.0 - bend))
+
+    views = grid_views(camera_at, magnifications, noise_px=0.05, views=4, seed=2)
+    setup = Setup(
+        tuple(views), np.array(magnifications), JSM.image_size, JSM.display_width_m, Priors()
+    )
+    fit = fit_joint(setup)
+    usual = build_problem(setup, fit.padded.functions, setup.views, fit.adjustment.spread)
+    own = columns_of(fit.padded.functions)["aspect"]
+    factors = (fit.padded.problem.prior_sigma / usual.prior_sigma)[own.start + 1 : own.stop]
+    fall = (factors[-1] / factors[0]) ** (1.0 / (len(factors) - 1))
+    assert fall > 0.6 if kink else fall < 0.45
 
 
 def test_the_part_of_the_corners_is_what_their_noise_does_and_the_parts_fit_in(
@@ -180,6 +224,10 @@ def test_magnifications_that_agree_make_the_prior_of_changes_about_half_as_wide(
         # The constants, and what has no changes, keep their prior.
         assert own[0] == 1.0
         if name in ("aspect", "xi_r", "xi_t"):
+            # The further ones fall, by the same factor with each order.
+            np.testing.assert_allclose(own[2:] / own[1:-1], own[2] / own[1], rtol=1e-12)
+            assert own[2] / own[1] == pytest.approx(
+                min(CHANGE_FALLS, key=lambda f: abs(f - own[2] / own[1]))
+            )
             # Two coefficients are determined at the most, and the usual size counts as a half.
-            np.testing.assert_allclose(own[1:], own[1], rtol=1e-12)
             assert np.sqrt(0.5 / 2.5) - 1e-6 <= own[1] < 0.8

@@ -63,8 +63,10 @@ from semcal_ros.core.calibration.estimator.residuals import corner_rows
 from semcal_ros.core.calibration.estimator.thresholds import (
     ALONG_LINE_MIN,
     CERTAINTY_STEP,
+    CHANGE_FALLS,
     CHANGE_LIMITS,
     CHANGE_UPDATES,
+    FALL_DOUBT,
     HELD_PART,
     JITTER_GAIN,
     JITTER_LENGTHS,
@@ -348,21 +350,54 @@ def _pad_functions(functions: Functions, names: Sequence[str]) -> dict[str, Cont
 def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) -> Array:
     """Return the (K,) prior sigmas of theta, with those of the changes of each function as large as they seem to be.
 
-    The prior of the changes is that of any microscope. How much a function of this one changes is a variance component,
-    estimated as in :mod:`~semcal_ros.core.calibration.estimator.variance_components`: the squares of its coefficients
-    but the first, in prior sigmas, over the number of them that the views determine.
+    The prior of the changes is that of any microscope. Two things about this one are estimated. How quickly the
+    coefficients fall with their order is the same for all functions; it maximises the evidence (:func:`log_evidence`),
+    but for half of a chi-square in favour of functions that bend more: what they do between two magnifications then
+    remains open. How much a function changes is a variance component, estimated as in
+    :mod:`~semcal_ros.core.calibration.estimator.variance_components`: the squares of its coefficients but the first, in
+    prior sigmas, over the number of them that the views determine.
     """
-    sigma, theta = problem.prior_sigma.copy(), result.state.theta
+    tried = [_changes_that_fall(padded, problem, result, by) for by in CHANGE_FALLS]
+    evidence = np.zeros(len(tried))
+    for k, sigma in enumerate(tried):
+        known = replace(problem, prior_sigma=sigma)
+        departure = result.state.theta - problem.prior_mean
+        evidence[k] = log_evidence(*result.equations(known), departure, sigma)
+    return tried[int(np.argmax(evidence >= evidence.max() - FALL_DOUBT))]
+
+
+def log_evidence(matrix: Array, right: Array, departure: Array, prior_sigma: Array) -> float:
+    """Return the logarithm of the probability of the data with a prior, but for what all priors have in common.
+
+    With the normal equations ``matrix`` (K, K) and ``right`` (K,) of a change of the unknowns, the prior in them, and
+    the (K,) ``departure`` of the unknowns from its mean (MacKay 1992, doi:10.1162/neco.1992.4.3.415, equation 2.4).
+    """
+    scaled, scale = equilibrate(matrix)
+    logarithm = np.linalg.slogdet(scaled)[1] - 2.0 * np.sum(np.log(scale))
+    misfit = np.sum((departure / prior_sigma) ** 2) - right @ solve_scaled(matrix, right)
+    return float(-0.5 * (misfit + logarithm) - np.sum(np.log(prior_sigma)))
+
+
+def _changes_that_fall(
+    padded: Functions, problem: Problem, result: BundleResult, by: float
+) -> Array:
+    """Return the prior sigmas with changes that fall by a factor with each order, as large as they seem to be."""
+    changing = {
+        name: slice(own.start + 1, own.start + padded[name].smooth_size)
+        for name, own in columns_of(padded).items()
+        if name in SMOOTH_AT_LAST and padded[name].smooth_size > 1
+    }
+    usual_sigma, theta = problem.prior_sigma.copy(), result.state.theta
+    for own in changing.values():
+        usual_sigma[own] *= by ** np.arange(own.stop - own.start)
+    sigma = usual_sigma.copy()
     for _ in range(CHANGE_UPDATES):
         known = replace(problem, prior_sigma=sigma)
         matrix, right = result.equations(known)
         freed = theta + solve_scaled(matrix, right)
         variance = np.diagonal(invert_scaled(matrix))
-        for name, every in columns_of(padded).items():
-            own = slice(every.start + 1, every.start + padded[name].smooth_size)
-            if name not in SMOOTH_AT_LAST or own.stop == own.start:
-                continue
-            usual = problem.prior_sigma[own]
+        for own in changing.values():
+            usual = usual_sigma[own]
             square = float(np.sum((freed[own] / usual) ** 2))
             determined = float(np.sum(np.maximum(1.0 - variance[own] / sigma[own] ** 2, 0.0)))
             ratio = np.sqrt((square + USUAL_CHANGES) / (determined + USUAL_CHANGES))

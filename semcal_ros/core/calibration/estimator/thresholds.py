@@ -264,6 +264,15 @@ USUAL_CHANGES = TABLE.stated(
     "Weight of the usual size of the changes of a function, against one that the views determine: two of them make "
     "it half as large at the least, so that few magnifications which happen to agree do not promise too much.",
 )
+CHANGE_FALLS = TABLE.defined(
+    "CHANGE_FALLS", (1.0, 0.84, 0.71, 0.59, 0.5, 0.42, 0.35, 0.3, 0.25), "per order",
+    "By how much coefficients fall besides the square of their order, that are tried: from those of a function with a "
+    "kink to those of one that is nearly a straight line, in steps of a sixth.",
+)
+FALL_DOUBT = TABLE.derived(
+    "FALL_DOUBT", 0.5, "half chi-square",
+    "One standard deviation of what the evidence tells: the slowest fall within it is taken.",
+)
 CHANGE_LIMITS = TABLE.stated(
     "CHANGE_LIMITS", (0.1, 3.0), "of the usual size",
     "Of the changes.",
