@@ -46,6 +46,7 @@ from semcal_ros.core.calibration.estimator.normal_equations import (
     schur_complement,
 )
 from semcal_ros.core.calibration.estimator.problem import (
+    SCAN_GAINS,
     Functions,
     Setup,
     build_problem,
@@ -351,9 +352,9 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
     """Return the (K,) prior sigmas of theta, with those of the changes of each function as large as they seem to be.
 
     The prior of the changes is that of any microscope. Two things about this one are estimated. How quickly the
-    coefficients fall with their order is the same for all functions; it maximises the evidence (:func:`log_evidence`),
-    but for half of a chi-square in favour of functions that bend more: what they do between two magnifications then
-    remains open. How much a function changes is a variance component, estimated as in
+    coefficients fall with their order is the same for all functions of the lens; it maximises the evidence
+    (:func:`log_evidence`), but for half of a chi-square in favour of functions that bend more. The gains of the scan
+    are not presumed to be that smooth. How much a function changes is a variance component, estimated as in
     :mod:`~semcal_ros.core.calibration.estimator.variance_components`: the squares of its coefficients but the first, in
     prior sigmas, over the number of them that the views determine.
     """
@@ -381,15 +382,18 @@ def log_evidence(matrix: Array, right: Array, departure: Array, prior_sigma: Arr
 def _changes_that_fall(
     padded: Functions, problem: Problem, result: BundleResult, by: float
 ) -> Array:
-    """Return the prior sigmas with changes that fall by a factor with each order, as large as they seem to be."""
+    """Return the prior sigmas with changes of the lens that fall by a factor with each order; all are as large as they
+    seem to be.
+    """
     changing = {
         name: slice(own.start + 1, own.start + padded[name].smooth_size)
         for name, own in columns_of(padded).items()
         if name in SMOOTH_AT_LAST and padded[name].smooth_size > 1
     }
     usual_sigma, theta = problem.prior_sigma.copy(), result.state.theta
-    for own in changing.values():
-        usual_sigma[own] *= by ** np.arange(own.stop - own.start)
+    for name, own in changing.items():
+        if name not in SCAN_GAINS:
+            usual_sigma[own] *= by ** np.arange(own.stop - own.start)
     sigma = usual_sigma.copy()
     for _ in range(CHANGE_UPDATES):
         known = replace(problem, prior_sigma=sigma)

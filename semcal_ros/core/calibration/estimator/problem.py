@@ -48,8 +48,9 @@ from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
 
-# The amplifiers of the scan change these at a breakpoint.
-_JUMPING = ("scale", "aspect", "skew")
+SCAN_GAINS = ("scale", "aspect", "skew")
+"""The functions that the amplifiers of the scan set at each magnification: they may jump, where lenses change smoothly.
+"""
 
 
 @dataclass(frozen=True)
@@ -256,7 +257,7 @@ class Setup:
 
     def breaks_of(self, name: str) -> Array:
         """Return the breakpoints of a camera parameter: only scale, aspect and skew have any."""
-        return np.array(self.breakpoints if name in _JUMPING else (), dtype=np.float64)
+        return np.array(self.breakpoints if name in SCAN_GAINS else (), dtype=np.float64)
 
     def coefficient_priors(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
         """Return means and sigmas of the coefficients of a function, ``size`` without its jumps.

@@ -266,8 +266,8 @@ USUAL_CHANGES = TABLE.stated(
 )
 CHANGE_FALLS = TABLE.defined(
     "CHANGE_FALLS", (1.0, 0.84, 0.71, 0.59, 0.5, 0.42, 0.35, 0.3, 0.25), "per order",
-    "By how much coefficients fall besides the square of their order, that are tried: from those of a function with a "
-    "kink to those of one that is nearly a straight line, in steps of a sixth.",
+    "By how much coefficients of the lens fall besides the square of their order, that are tried: from those of a "
+    "function with a kink to those of one that is nearly a straight line, in steps of a sixth.",
 )
 FALL_DOUBT = TABLE.derived(
     "FALL_DOUBT", 0.5, "half chi-square",
