@@ -32,8 +32,8 @@ from scipy.ndimage import map_coordinates, spline_filter
 from benchmarks.table import show
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftSettings
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 
 CONTRAST, NOISE = 40.0, 8.0

@@ -26,11 +26,12 @@ from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftPath, DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.frame_time import (
     estimate_frame_time,
 )
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.thresholds import (
     SHEAR_OF_SHIFT_DISTORTED,
     SHEAR_OF_SHIFT_RECTIFIED,

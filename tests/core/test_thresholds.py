@@ -74,6 +74,25 @@ def test_no_number_of_the_room_stands_elsewhere(room: Path) -> None:
     assert {p: names for p, names in named.items() if names - NO_THRESHOLDS} == {}
 
 
+def test_defaults_of_settings_stand_in_the_table() -> None:
+    """Of the classes ``...Settings`` of the method: a number that a caller may change has a source, too."""
+    found, beside = set(), []
+    for module in house.read_modules(ROOT, "core"):
+        for own in ast.walk(module.tree):
+            if not (isinstance(own, ast.ClassDef) and own.name.endswith("Settings")):
+                continue
+            found.add(own.name)
+            beside += [
+                f"{module.path}: {ast.unparse(field.target)}"
+                for field in own.body
+                if isinstance(field, ast.AnnAssign) and field.value is not None
+                for part in ast.walk(field.value)
+                if isinstance(part, ast.Constant) and type(part.value) in (int, float)
+            ]
+    assert {"DriftSettings", "RegistrationSettings"} <= found
+    assert beside == []
+
+
 def test_numbers_without_a_table_are_few_and_say_their_source() -> None:
     found: dict[str, list[tuple[str, str]]] = {}
     for module in (m for floor in FLOORS for m in house.read_modules(ROOT, floor)):

@@ -35,6 +35,7 @@ with warnings.catch_warnings():
 
 
 from semcal_ros.bridge.continuous_parameters import PARAMETER_KINDS
+from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.nodes.common import base
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.synthetic import preset
@@ -314,6 +315,17 @@ def test_every_key_of_the_calibration_file_is_described() -> None:
     }
     text = _text("calibration_file.md")
     assert {key for key in keys if f"`{key}`" not in text} == set()
+
+
+@pytest.mark.parametrize("page", ["model.md", "calibration_file.md"])
+def test_every_parameter_of_the_camera_is_described(page: str) -> None:
+    text = _text(page)
+    named = set(re.findall(r"`(\w+)`", text))
+    for stem, first, last in re.findall(r"`(\w+)(\d)` to `\1(\d)`", text):
+        named |= {f"{stem}{k}" for k in range(int(first), int(last) + 1)}
+    if page == "calibration_file.md":
+        named |= {"m"}  # relative to its nominal value there, as `scale`
+    assert set(ALL_NAMES) - named == set()
 
 
 def test_the_preset_beside_the_paper_is_that_of_the_code() -> None:

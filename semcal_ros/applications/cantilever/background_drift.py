@@ -53,8 +53,9 @@ from semcal_ros.applications.cantilever.thresholds import (
     TILES_MIN,
 )
 from semcal_ros.core.arrays import Array, Image, Mask
-from semcal_ros.core.drift.estimates import DriftPath, DriftSettings
+from semcal_ros.core.drift.estimates import DriftPath
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure

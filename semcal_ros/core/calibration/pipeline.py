@@ -28,8 +28,8 @@ Each stage is a function from what the one before it returns, which is frozen.
 - *judge* (:func:`~semcal_ros.core.calibration.judge.judge`): the calibration, its certificate, its held-out errors,
   and its weaknesses.
 
-Around select and solve goes the search for views that disagree with the others. The first two stages see images, and
-:func:`calibrate_views` does the rest.
+Around start, select and solve goes the search for views that disagree with the others. The first two stages see images,
+and :func:`calibrate_views` does the rest.
 """
 
 from __future__ import annotations

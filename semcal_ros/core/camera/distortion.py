@@ -36,6 +36,9 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.thresholds import LENS_STEPS_MAX, LENS_TOLERANCE
 
+LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u")
+"""The coefficients, in the order in which the functions below take and derive them."""
+
 
 @dataclass(frozen=True)
 class Undistortion:
@@ -102,8 +105,8 @@ def distort_jacobians(
     Returns
     -------
     f, df_dq, df_dxi
-        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 4); the last axis of ``df_dxi`` is (xi_r,
-        xi_t, xi_s, xi_u).
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 4); the last axis of ``df_dxi`` is in the order of
+        :data:`LENS_NAMES`.
     """
     xi_radial = np.asarray(xi_r, dtype=np.float64)
     xi_tangential = np.asarray(xi_t, dtype=np.float64)
@@ -117,7 +120,7 @@ def distort_jacobians(
     along = 2.0 * growth * xi_radial
     tangential_x, tangential_y = 2.0 * xi_tangential * x, 2.0 * xi_tangential * y
     # In memory the points come last, which is faster; in shape they come first, as elsewhere.
-    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((4, 2, len(q)))
+    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((len(LENS_NAMES), 2, len(q)))
     df_dq[0, 0] = along * x * x + factor + 3.0 * tangential_x
     df_dq[0, 1] = along * x * y + tangential_y
     df_dq[1, 0] = along * x * y + tangential_x
@@ -142,10 +145,8 @@ def distort_jacobians(
     return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, (0, 1), (2, 1))
 
 
-def undistort_normalised(
-    q_d: Array, xi_r: float, xi_t: float, xi_s: float = 0.0, xi_u: float = 0.0
-) -> Undistortion:
-    """Invert the distortion of (n, 2) normalised points.
+def undistort_normalised(q_d: Array, xi_r: float, *others: float) -> Undistortion:
+    """Invert the distortion of (n, 2) normalised points, with coefficients in the order of :data:`LENS_NAMES`.
 
     The radial part alone has the closed inverse ``q_d / (1 + xi_r |q_d|^2)``, which starts Newton's
     method with the analytic Jacobian. Fails (``converged`` false, NaN) where the point has no ideal
@@ -154,7 +155,7 @@ def undistort_normalised(
     rd2 = np.sum(q_d * q_d, axis=1)
     branch = np.isfinite(rd2) & (1.0 + xi_r * rd2 > 0.0) & (xi_r * rd2 < 1.0)
     start = q_d / np.where(branch, 1.0 + xi_r * rd2, np.nan)[:, None]
-    if xi_t == xi_s == xi_u == 0.0:
+    if not any(others):
         return Undistortion(start, branch, 0, np.where(branch, 0.0, np.nan))
 
     q = np.where(branch[:, None], start, np.nan)
@@ -164,7 +165,7 @@ def undistort_normalised(
     active = np.flatnonzero(branch)
     while active.size and iterations < LENS_STEPS_MAX:
         iterations += 1
-        f, jacobian, _ = distort_jacobians(q[active], xi_r, xi_t, xi_s, xi_u)
+        f, jacobian, _ = distort_jacobians(q[active], xi_r, *others)
         residual = q_d[active] - f
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.camera.distortion import distort_jacobians, distort_normalised
+from semcal_ros.core.camera.distortion import LENS_NAMES, distort_jacobians, distort_normalised
 from semcal_ros.core.camera.scan_distortion import (
     ALONG_COUNT,
     SCAN_NAMES,
@@ -55,12 +55,16 @@ PARAMETER_NAMES: tuple[str, ...] = (
     "ey",
 )
 """The parameters that every camera has."""
-ALL_NAMES: tuple[str, ...] = (*PARAMETER_NAMES, "xi_s", "xi_u", *SCAN_NAMES)
+_FURTHER_LENS_NAMES = tuple(name for name in LENS_NAMES if name not in PARAMETER_NAMES)
+ALL_NAMES: tuple[str, ...] = (*PARAMETER_NAMES, *_FURTHER_LENS_NAMES, *SCAN_NAMES)
 """All parameters: after those of every camera further distortion of the lens, and the distortion of the scan."""
-CAMERA_SIZES: tuple[int, ...] = tuple(
-    ALL_NAMES.index(last) + 1 for last in ("ey", "xi_u", SCAN_NAMES[-1])
+CAMERA_SIZES: tuple[int, ...] = (
+    len(PARAMETER_NAMES),
+    len(PARAMETER_NAMES) + len(_FURTHER_LENS_NAMES),
+    len(ALL_NAMES),
 )
 """How many of :data:`ALL_NAMES` a camera may have: the first ones, those of the lens, or all. Fewer are faster."""
+_FURTHER_LENS, _SCAN = slice(*CAMERA_SIZES[:2]), slice(*CAMERA_SIZES[1:])
 
 
 def camera_size(names: Collection[str]) -> int:
@@ -118,8 +122,8 @@ def _distortion(parameters: Array) -> tuple[list[Array], Array | None]:
     lens = [parameters[..., 6], parameters[..., 7]]
     count = parameters.shape[-1]
     if count > CAMERA_SIZES[0]:
-        lens += [parameters[..., 10], parameters[..., 11]]
-    return lens, parameters[..., 12:] if count > CAMERA_SIZES[1] else None
+        lens += list(np.moveaxis(parameters[..., _FURTHER_LENS], -1, 0))
+    return lens, parameters[..., _SCAN] if count > CAMERA_SIZES[1] else None
 
 
 def project_points_with_jacobians(
@@ -173,10 +177,10 @@ def project_points_with_jacobians(
         d_parameters[row, 9] = -by_y
         d_parameters[row, 8 + row] += per_stretch
         if count > CAMERA_SIZES[0]:
-            d_parameters[row, 10:12] = by_xi[2:]
+            d_parameters[row, _FURTHER_LENS] = by_xi[2:]
         if scan is not None:
             functions = slice(0, ALONG_COUNT) if row == 0 else slice(ALONG_COUNT, None)
-            d_parameters[row, 12:][functions] = -per_stretch * scan.basis[functions]
+            d_parameters[row, _SCAN][functions] = -per_stretch * scan.basis[functions]
     return ProjectionJacobians(
         xy,
         np.moveaxis(d_xyz, -1, 0),

@@ -305,7 +305,7 @@ class ResidualField:
         return float(np.max(total))
 
     def overlaps(self) -> Array:
-        """Return (23, slice_size) inner products with the patterns of the rest of the model.
+        """Return (k, slice_size) inner products with the k patterns of the rest of the model.
 
         These are the shifts, the linear maps, the patterns of the distortion of the lens about the middle of the
         picture, and those of the distortion of the scan, each with a mean square of 1 over the domain. A field whose

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.distortion import (
+    LENS_NAMES,
     Undistortion,
     distort_jacobians,
     distort_normalised,
@@ -229,7 +230,7 @@ class ScanCamera:
 
     @property
     def _lens(self) -> tuple[float, ...]:
-        return self.xi_r, self.xi_t, self.xi_s, self.xi_u
+        return tuple(getattr(self, name) for name in LENS_NAMES)
 
     @property
     def _scan_amplitudes(self) -> Array:

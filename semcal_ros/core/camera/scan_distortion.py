@@ -67,7 +67,7 @@ SCAN_NAMES: tuple[str, ...] = (
     "coil_y5",
 )
 """Amplitudes in half image widths: of the functions along the lines, then of those across them."""
-SETTLING = slice(4, 9)
+SETTLING = slice(SCAN_NAMES.index("settling_1"), SCAN_NAMES.index("coil_y2"))
 """Which of these are the settling."""
 ALONG_COUNT: int = SETTLING.stop
 """How many of them are along the lines."""
@@ -106,7 +106,7 @@ class ScanDerivatives:
     stretch
         (2, n) derivative of the deflection by the raw pixel along each axis.
     basis
-        (13, n) derivative of the deflection by the amplitudes in the order of :data:`SCAN_NAMES`, px.
+        (k, n) derivative of the deflection by the k amplitudes in the order of :data:`SCAN_NAMES`, px.
     """
 
     stretch: Array
@@ -124,6 +124,7 @@ def _line_of_decay(time: float) -> tuple[float, float]:
 
 _LINES = np.array([_line_of_decay(time) for time in SETTLING_TIMES])
 _RATES = -1.0 / np.array(SETTLING_TIMES)
+_DEGREE = LEGENDRE_POWERS.shape[1] - 1
 
 
 def _decays(u: Array) -> tuple[Array, Array]:
@@ -139,10 +140,10 @@ def _decays(u: Array) -> tuple[Array, Array]:
 def _functions(u: Array, axis: int) -> tuple[Array, Array]:
     """Return the functions of an axis, (k, n), and their slopes; straight lines beyond the picture."""
     inside = np.clip(u, -SCAN_END, SCAN_END)
-    powers = np.stack([np.ones_like(inside), *np.cumprod(np.stack([inside] * 5), axis=0)])
+    powers = np.stack([np.ones_like(inside), *np.cumprod(np.stack([inside] * _DEGREE), axis=0)])
     values, slopes = (
         LEGENDRE_POWERS @ powers,
-        (LEGENDRE_POWERS[:, 1:] * np.arange(1.0, 6.0)) @ powers[:-1],
+        (LEGENDRE_POWERS[:, 1:] * np.arange(1.0, _DEGREE + 1.0)) @ powers[:-1],
     )
     if axis == 0:
         decays, decay_slopes = _decays(inside)
@@ -151,7 +152,7 @@ def _functions(u: Array, axis: int) -> tuple[Array, Array]:
 
 
 def scan_functions(u: Array, axis: int) -> Array:
-    """Return the functions along the lines (``axis`` 0) or across them at ``u`` in half pictures, (9 or 4, n)."""
+    """Return the functions along the lines (``axis`` 0) or across them at ``u`` in half pictures, (k, n)."""
     return _functions(u, axis)[0]
 
 
@@ -166,7 +167,7 @@ def _amplitudes(amplitudes: Array, axis: int) -> Array:
 
 
 def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
-    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (13,) or (n, 13)."""
+    """Return deflection minus raw pixel, (n, 2) px, at raw pixels (n, 2); ``amplitudes`` are (k,) or (n, k)."""
     out = np.zeros_like(xy)
     for axis in (0, 1):
         of_axis = _amplitudes(amplitudes, axis)
@@ -187,7 +188,7 @@ def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) ->
     """Return the raw pixels (n, 2) at which the beam is deflected to ``deflection`` (n, 2), px.
 
     Newton's method along each axis on its own. A point without a raw pixel, where the beam would stand still or go
-    back, is NaN. ``amplitudes`` are (13,) or (n, 13).
+    back, is NaN. ``amplitudes`` are (k,) or (n, k), in the order of :data:`SCAN_NAMES`.
     """
     raw = deflection.copy()
     for axis in (0, 1):
@@ -223,7 +224,7 @@ class _Curve:
     Attributes
     ----------
     powers
-        (6, ...) coefficients of the powers of u.
+        (p, ...) coefficients of the powers of u, the constant first.
     decays
         Amplitude and rate of each decay.
     """
@@ -234,8 +235,8 @@ class _Curve:
     def value(self, u: Array) -> tuple[Array, Array]:
         """Return the value and the slope at ``u`` (n,); a straight line beyond the picture."""
         inside = np.clip(u, -SCAN_END, SCAN_END)
-        value, slope = self.powers[5] * np.ones_like(u), np.zeros_like(u)
-        for power in self.powers[4::-1]:
+        value, slope = self.powers[-1] * np.ones_like(u), np.zeros_like(u)
+        for power in self.powers[-2::-1]:
             slope *= inside
             slope += value
             value *= inside

@@ -21,7 +21,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.camera.distortion import distort_normalised
+from semcal_ros.core.camera.distortion import LENS_NAMES, distort_normalised
 from semcal_ros.core.camera.projection import PARAMETER_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, SETTLING, deflection_shift
@@ -36,6 +36,7 @@ TERM_KINDS: tuple[str, ...] = (
     "residual field",
 )
 """The kinds of distortion: of the lens, of the scan, and what both leave."""
+_LENS_KINDS = {"radial": ("xi_r",), "decentring": ("xi_t", "xi_u"), "spiral": ("xi_s",)}
 
 
 def has_terms(camera: ScanCamera) -> bool:
@@ -69,11 +70,7 @@ def displace_by(camera: ScanCamera, kind: str, xy: Array) -> Array:
         if kind == "coils":
             chosen = ~chosen
         return deflection_shift(xy, np.where(chosen, amplitudes, 0.0), camera.raster)
-    lens = {
-        "radial": (camera.xi_r, 0.0, 0.0, 0.0),
-        "decentring": (0.0, camera.xi_t, 0.0, camera.xi_u),
-        "spiral": (0.0, 0.0, camera.xi_s, 0.0),
-    }[kind]
+    lens = [getattr(camera, n) if n in _LENS_KINDS[kind] else 0.0 for n in LENS_NAMES]
     q = (xy - [camera.ex, camera.ey]) / camera.norm_px
     return camera.norm_px * (distort_normalised(q, *lens) - q)
 

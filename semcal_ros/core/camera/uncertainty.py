@@ -13,7 +13,8 @@
 # limitations under the License.
 
 """What the uncertainty of nm per pixel, and of a length in an image, consists of; and the errors that a camera's
-covariance predicts over the field.
+covariance predicts over the field. The 1-sigma of a pixel size itself is that of its camera,
+:attr:`~semcal_ros.core.camera.scan_camera.ScanCamera.pixel_size_sigma_m`.
 
 The parts are independent and add as variances (JCGM 100:2008, "GUM", 5.1.2); the expanded uncertainty has the coverage
 factor 2, which is 95 % for a normal distribution (6.2.1).

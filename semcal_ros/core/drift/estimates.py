@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Settings and results of drift tracking."""
+"""What tracking says of the drift: its status, its value at a frame, at other times, and along a recording."""
 
 from __future__ import annotations
 
@@ -35,69 +35,7 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.failures import MatchFailure
-from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.core.wording import omit_numbers
-
-
-@dataclass(frozen=True)
-class DriftSettings:
-    """How drift is tracked.
-
-    Attributes
-    ----------
-    registration
-        Limits of a single registration.
-    rekey_overlap
-        The keyframe is replaced when less than this fraction of the image still overlaps with it.
-    max_jump
-        A shift between frames beyond this fraction of the field is a move of the stage, not
-        drift.
-    first_step_px
-        Expected drift (1-sigma) between the first two frames, px.
-    max_ratio
-        Largest change of magnification across which the keyframe is carried by resampling.
-    lost_after
-        Number of frames in a row that cannot be matched after which tracking starts again at the
-        predicted drift.
-    acceleration_psd
-        Process noise, m^2/s^3 (px^2/s^3 without a camera); None adapts it to the stream.
-    average
-        Whether frames are added to their keyframe, so that its noise does not limit what follows.
-    max_keyframes, max_keyframe_bytes
-        Number of images that are kept to come back to, and their memory.
-    interpolation
-        Interpolation of the rectification before registration.
-    similarity
-        Whether a rotation and a change of scale are looked for, and removed as drift. Not where what the specimen
-        does is the point, as for a servo that turns it.
-    """
-
-    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    rekey_overlap: float = 0.6
-    max_jump: float = 0.25
-    first_step_px: float = 3.0
-    max_ratio: float = 2.5
-    lost_after: int = 8
-    acceleration_psd: float | None = None
-    average: bool = True
-    max_keyframes: int = 48
-    max_keyframe_bytes: int = 1 << 28
-    interpolation: str = "cubic"
-    similarity: bool = False
-
-    def __post_init__(self) -> None:
-        checks = (
-            ("rekey_overlap", 0.0 < self.rekey_overlap < 1.0, "a fraction between 0 and 1"),
-            ("max_jump", 0.0 < self.max_jump <= 1.0, "a fraction between 0 and 1"),
-            ("first_step_px", self.first_step_px > 0.0, "a positive number of px"),
-            ("max_ratio", self.max_ratio >= 1.0, "at least 1"),
-            ("lost_after", self.lost_after >= 2, "at least 2 frames"),
-            ("max_keyframes", self.max_keyframes >= 2, "at least 2"),
-            ("acceleration_psd", (self.acceleration_psd or 0.0) >= 0.0, "a number >= 0 or None"),
-        )
-        for name, good, expected in checks:
-            if not good:
-                raise InvalidValueError(f"{name} = {getattr(self, name)}", expected=expected)
 
 
 class DriftStatus(Enum):

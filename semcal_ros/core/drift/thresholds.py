@@ -23,6 +23,39 @@ TABLE = Table()
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
+# Defaults of DriftSettings, in settings.py
+
+REKEY_OVERLAP = TABLE.stated(
+    "REKEY_OVERLAP", 0.6, "of the image",
+    "That a keyframe must share with a frame to stay the one in use: twice the least with which a shift is searched "
+    "for, so that the next keyframe is measured against it while both still see much of the same.",
+)
+JUMP_MAX = TABLE.stated(
+    "JUMP_MAX", 0.25, "of the image",
+    "Between frames; more that was not expected is a move of the stage: drift is slower by far.",
+)
+FIRST_STEP_PX = TABLE.stated(
+    "FIRST_STEP_PX", 3.0, "px",
+    "1-sigma of the drift between the first two frames, of which nothing is known; innovations take its place.",
+)
+RATIO_MAX = TABLE.stated(
+    "RATIO_MAX", 2.5, "ratio of scales",
+    "Across which a keyframe is resampled: at this one, a sixth of the coarser picture is in the finer one.",
+)
+LOST_AFTER = TABLE.stated(
+    "LOST_AFTER", 8, "frames",
+    "In a row that match nothing, after which the place that was seen is given up: what disturbs a few frames, as a "
+    "touch of the table does, is over by then.",
+)
+KEYFRAMES_MAX = TABLE.cost(
+    "KEYFRAMES_MAX", 48, "keyframes",
+    "That are kept: each adds four numbers to the state of the filter, whose covariance is updated at each frame.",
+)
+KEYFRAME_BYTES_MAX = TABLE.cost(
+    "KEYFRAME_BYTES_MAX", 1 << 28, "bytes",
+    "Of their images: 32 of 1024 x 1024 pixels, each as a mean of 4 bytes and a first frame of up to 4.",
+)
+
 # Steps, in tracker.py
 
 VELOCITY_CHANGE = TABLE.stated(

@@ -37,12 +37,7 @@ from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.camera_uncertainty import centre_covariance
-from semcal_ros.core.drift.estimates import (
-    DriftPredictor,
-    DriftSettings,
-    DriftStatus,
-    DriftUpdate,
-)
+from semcal_ros.core.drift.estimates import DriftPredictor, DriftStatus, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import use_match
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
@@ -54,6 +49,7 @@ from semcal_ros.core.drift.new_keyframes import add_keyframe, renew_keyframe
 from semcal_ros.core.drift.operations import Predict
 from semcal_ros.core.drift.recovery import coast, restart
 from semcal_ros.core.drift.remade_keyframes import clean_keyframes
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState
 from semcal_ros.core.drift.state import initial_state
 from semcal_ros.core.drift.thresholds import (

@@ -27,13 +27,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
-from semcal_ros.core.drift.estimates import (
-    DriftPredictor,
-    DriftSettings,
-    DriftStatus,
-    DriftUpdate,
-    forget_prior,
-)
+from semcal_ros.core.drift.estimates import DriftPredictor, DriftStatus, DriftUpdate, forget_prior
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.flicker import FlickerEstimator
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame
@@ -42,6 +36,7 @@ from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.lines import LinesOnly
 from semcal_ros.core.drift.operations import Inflate, Marginalise, Operation
 from semcal_ros.core.drift.own_motion import OwnMotionEstimator
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState, turn_drift
 from semcal_ros.core.drift.static_parts import StaticParts
 from semcal_ros.core.errors import Rejection

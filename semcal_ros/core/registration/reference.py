@@ -24,6 +24,14 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
 from semcal_ros.core.registration.one_direction import OneDirection, find_direction
 from semcal_ros.core.registration.periodicity import find_periods
+from semcal_ros.core.registration.thresholds import (
+    COMPETING_HEIGHT_MIN,
+    CORRELATION_MIN,
+    DEVIATIONS_MIN,
+    OVERLAP_MIN,
+    SATURATED_MAX,
+    SIGMA_PX_MAX,
+)
 from semcal_ros.core.registration.tiles import PyramidLevel
 
 #: Valid rectangle (left, top, right, bottom) in px, right and bottom exclusive.
@@ -32,7 +40,8 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class RegistrationSettings:
-    """Limits of :func:`~semcal_ros.core.registration.register.register`.
+    """Limits of :func:`~semcal_ros.core.registration.register.register`; the defaults have their sources in
+    :mod:`semcal_ros.core.registration.thresholds`.
 
     Attributes
     ----------
@@ -56,12 +65,12 @@ class RegistrationSettings:
         what moves as it does is followed. None: what moves as predicted, or nearly all.
     """
 
-    min_overlap: float = 0.3
-    max_sigma_px: float = 0.5
-    min_correlation: float = 0.6
-    max_saturated: float = 0.5
-    min_competing_height: float = 0.7
-    min_deviations: float = 5.0
+    min_overlap: float = OVERLAP_MIN
+    max_sigma_px: float = SIGMA_PX_MAX
+    min_correlation: float = CORRELATION_MIN
+    max_saturated: float = SATURATED_MAX
+    min_competing_height: float = COMPETING_HEIGHT_MIN
+    min_deviations: float = DEVIATIONS_MIN
     texture_region: Region | None = None
     follow: tuple[float, float, float, float] | None = None
 

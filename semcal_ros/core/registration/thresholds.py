@@ -25,6 +25,34 @@ TABLE = Table()
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
+# Defaults of RegistrationSettings, in reference.py
+
+OVERLAP_MIN = TABLE.stated(
+    "OVERLAP_MIN", 0.3, "of the smaller image",
+    "For a shift to be searched for: the less two images have in common, the higher they correlate by chance.",
+)
+SIGMA_PX_MAX = TABLE.stated(
+    "SIGMA_PX_MAX", 0.5, "px",
+    "1-sigma of a shift in its worst direction, so that it is right to a pixel in 95 of 100 frames.",
+)
+CORRELATION_MIN = TABLE.stated(
+    "CORRELATION_MIN", 0.6, "correlation",
+    "Free of noise; below, two thirds of the variance of either image (1 - 0.6^2) are not in the other one.",
+)
+SATURATED_MAX = TABLE.stated(
+    "SATURATED_MAX", 0.5, "of the pixels",
+    "At either end of the grey scale, where they show nothing.",
+)
+COMPETING_HEIGHT_MIN = TABLE.stated(
+    "COMPETING_HEIGHT_MIN", 0.7, "of the highest peak",
+    "Of peaks that are compared by how well they explain the image; lower ones are structure that resembles itself "
+    "a little.",
+)
+DEVIATIONS_MIN = TABLE.derived(
+    "DEVIATIONS_MIN", 5.0, "standard errors",
+    "By which a peak must explain the image better than each other one: by chance, one in 3.5 million does.",
+)
+
 # Believed shifts, in acceptance.py and one_direction.py
 
 STAGES_APART_PX_MAX = TABLE.stated(

@@ -15,6 +15,7 @@
 """An image file of any kind, and what it says about each of its images.
 
 TIFF files and videos have modules of their own; files of one image (PNG, JPEG, BMP, GIF, WebP) are read here.
+Another format begins in :func:`is_image_file` and :func:`describe_image_file`.
 """
 
 from __future__ import annotations

@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Read SEM images of any known maker: one page of a TIFF, or all of them, with its grey pixels."""
+"""Read SEM images of any known maker: one page of a TIFF, or all of them, with its grey pixels.
+
+Whose file it is, its tags say, else a text beside it (:func:`side_file_settings`); each maker has a module beside this
+one.
+"""
 
 from __future__ import annotations
 

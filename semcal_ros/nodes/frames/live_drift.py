@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.drift.estimates import DriftEstimate, DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftEstimate, DriftUpdate
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.binning import bin_image
@@ -44,7 +45,7 @@ from semcal_ros.nodes.workers.drift_worker import DriftProcess, Measurement, mea
 _RESTARTING = (
     ParameterDeclaration(
         "keyframe_overlap",
-        0.6,
+        DriftSettings.rekey_overlap,
         "A new keyframe is taken when less than this fraction of the image overlaps with the last one."
         " A change restarts the tracking.",
         low=0.1,
@@ -52,7 +53,7 @@ _RESTARTING = (
     ),
     ParameterDeclaration(
         "max_jump",
-        0.25,
+        DriftSettings.max_jump,
         "A shift between frames beyond this fraction of the field counts as a move of the stage."
         " A change restarts the tracking.",
         low=0.01,

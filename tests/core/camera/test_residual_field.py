@@ -23,6 +23,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semcal_ros.core.camera.distortion import LENS_NAMES
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
@@ -114,7 +115,8 @@ def test_beyond_the_range_the_field_of_the_nearer_end_holds():
 def test_overlaps_are_the_integrals_that_they_say():
     field = _field(3)
     overlaps = field.overlaps()
-    assert overlaps.shape == (10 + len(SCAN_NAMES), field.slice_size)
+    scan = 6 + len(LENS_NAMES)
+    assert overlaps.shape == (scan + len(SCAN_NAMES), field.slice_size)
     rows = overlaps @ field.at(1000.0).coefficients.ravel()
     # Gauss nodes, thirty between knots and the borders of the picture: there, fields and patterns are smooth.
     nodes, weights = np.polynomial.legendre.leggauss(30)
@@ -142,13 +144,13 @@ def test_overlaps_are_the_integrals_that_they_say():
     for row, pattern, tolerance in (
         (0, np.stack([one, zero], 1), 1e-12),
         (3, np.stack([q[:, 1], zero], 1), 1e-12),
-        (6, radial, 1e-12),
-        (7, tangential, 1e-12),
-        (8, spiral, 1e-12),
-        (9, tangential * [1.0, -1.0], 1e-12),
-        (10 + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
+        (6 + LENS_NAMES.index("xi_r"), radial, 1e-12),
+        (6 + LENS_NAMES.index("xi_t"), tangential, 1e-12),
+        (6 + LENS_NAMES.index("xi_s"), spiral, 1e-12),
+        (6 + LENS_NAMES.index("xi_u"), tangential * [1.0, -1.0], 1e-12),
+        (scan + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
         # A decay is no polynomial, nor a coil one beyond the picture: six nodes in each cell are not quite exact.
-        (10 + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),
+        (scan + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),
     ):
         expected = weight @ np.sum(shift * pattern, axis=1)
         expected /= np.sqrt(weight @ np.sum(pattern**2, axis=1))

@@ -23,7 +23,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semcal_ros.core.camera.calibration_model import TERM_NAMES
 from semcal_ros.core.camera.distortion import distort_normalised, undistort_normalised
+from semcal_ros.core.camera.projection import project_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 
@@ -94,6 +96,17 @@ def test_distorting_reverts_undistorting(points, radial, tangential):
     np.testing.assert_allclose(
         camera.distort(ideal[report.converged]), raw[report.converged], atol=1e-8
     )
+
+
+@pytest.mark.parametrize("name", TERM_NAMES)
+def test_every_term_is_projected_as_in_an_adjustment_and_undone(name):
+    radial = replace(BENT, xi_t=0.0)
+    camera = replace(radial, **{name: 0.005})
+    points = np.random.default_rng(0).uniform(-5e-5, 5e-5, (20, 3))
+    raw = camera.project(points)
+    np.testing.assert_allclose(raw, project_points(camera.all_parameters, points, camera.raster))
+    assert np.max(np.abs(raw - radial.project(points))) > 0.01
+    np.testing.assert_allclose(camera.undistort(raw), camera.project_ideal(points), atol=1e-8)
 
 
 def test_outside_of_the_domain_there_is_no_answer():

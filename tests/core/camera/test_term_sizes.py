@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.camera.calibration_model import TERM_NAMES
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.term_sizes import (
@@ -76,6 +77,13 @@ def test_the_largest_displacement_is_that_of_the_formula(changes, kind, expected
     sizes = measure_terms(replace(PLAIN, **changes))
     assert sizes[kind] == pytest.approx(expected, rel=1e-9)
     assert [name for name, size in sizes.items() if size] == [kind]
+
+
+@pytest.mark.parametrize("name", TERM_NAMES)
+def test_every_term_is_of_a_kind(name):
+    assert (
+        len([size for size in measure_terms(replace(PLAIN, **{name: 0.01})).values() if size]) == 1
+    )
 
 
 def test_settling_is_largest_in_the_first_column():

@@ -27,9 +27,10 @@ from scipy.ndimage import map_coordinates, spline_filter
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import (
     SimilarityEstimate,
     SimilarityMatch,

@@ -25,8 +25,9 @@ import pytest
 
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift import matching
-from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState
 from semcal_ros.core.drift.tracker import DriftTracker, step
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState

@@ -27,10 +27,11 @@ from scipy import ndimage
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.estimates import DriftSettings, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.drift.frame import MotionCorrector
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.remade_keyframes import correct_shear
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.drift.tracker_state import TrackerSetup
 from semcal_ros.core.errors import InvalidValueError

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from benchmarks.drift.scenes import KINDS, draw
-from semcal_ros.core.drift.estimates import DriftSettings
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.reference import RegistrationSettings

@@ -60,6 +60,7 @@ MIDDLE = SIDE // 2
         (stats.norm.sf(t.SIGNAL_SIGMAS), 44),
         (stats.chi2.sf(t.ROWS_RATIO_MIN * (t.NOISE_ROWS_MIN - 1), t.NOISE_ROWS_MIN - 1), 28),
         (stats.norm.sf(t.CHANCE_SIGMAS), 3.5e6),
+        (stats.norm.sf(t.DEVIATIONS_MIN), 3.5e6),
         (500.0 * stats.chi2.sf(t.PULL_CHI2_MIN, 2), 20),
     ],
 )
@@ -76,6 +77,8 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
         # Coefficients of the spectrum of a real image, for each ring.
         (t.TEXTURE_PX_MIN * (t.TEXTURE_PX_MIN // 2 + 1) / t.SPECTRUM_RINGS, 3.0, 0.0),
         (t.HALVES_PX_MAX / 300.0, 1e-3, 1e-12),
+        (1.0 - t.CORRELATION_MIN**2, 2.0 / 3.0, 0.03),
+        (stats.norm.cdf(1.0 / t.SIGMA_PX_MAX) - stats.norm.cdf(-1.0 / t.SIGMA_PX_MAX), 0.95, 0.005),
         (t.CHANGE_PRECISION**-0.5, 32.0, 0.5),
         (1.0 / math.sqrt(2.0 * (t.COMMON_TILES_MIN - 1)), 0.18, 0.005),
         (math.degrees(math.asin(t.PERIODS_SINE_MIN)), 17.0, 0.5),

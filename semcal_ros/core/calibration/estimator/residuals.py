@@ -20,7 +20,8 @@ height, its drift, the shape of its lattice, and its orientation, from the stage
 untilted. The priors of visits and of theta are independent of each other and need no derivatives.
 
 To add a residual of a view, write a function like :func:`height_residual` and name it in
-:data:`VIEW_RESIDUALS`: solver, covariance and tests go through that table.
+:data:`VIEW_RESIDUALS`: solver, covariance and tests go through that table (``doc/how_it_runs.md``, "How to add a
+residual").
 """
 
 from __future__ import annotations

@@ -18,6 +18,8 @@ A wrong magnification is a wrong scale. Under a perspective projection the heigh
 it; under a parallel one a tilt of a stretched grid does in part. So a view is compared with the
 others in three ways: its height with those at its own magnification, its misfit and the stretch of
 its lattice with all.
+
+What is found here is left out in :mod:`semcal_ros.core.calibration.pipeline`, which fits anew.
 """
 
 from __future__ import annotations
