@@ -270,8 +270,8 @@ CHANGE_FALLS = TABLE.defined(
     "function with a kink to those of one that is nearly a straight line, in steps of a sixth.",
 )
 FALL_DOUBT = TABLE.derived(
-    "FALL_DOUBT", 0.5, "half chi-square",
-    "One standard deviation of what the evidence tells: the slowest fall within it is taken.",
+    "FALL_DOUBT", 2.0, "half chi-square",
+    "Two standard deviations of what the evidence tells: the slowest fall within them is taken.",
 )
 CHANGE_LIMITS = TABLE.stated(
     "CHANGE_LIMITS", (0.1, 3.0), "of the usual size",
