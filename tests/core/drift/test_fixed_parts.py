@@ -161,9 +161,8 @@ def test_a_reference_is_kept_where_little_more_of_it_is_left_out(
     np.testing.assert_array_equal(reference.fixed, many)
     # A shift is the same as with one that was prepared anew, to a tenth of its sigma.
     image = remove_overlay(picture((2.3, -1.4), 1), more)
-    options = {"guess_px": (2.0, -1.0), "guess_covariance": EYE, "fixed": more}
     fresh, kept = (
-        register(one, image, **options)
+        register(one, image, guess_px=(2.0, -1.0), guess_covariance=EYE, fixed=more)
         for one in (keyframe(more).prepare_reference(settings), replace(before, fixed=more))
     )
     assert fresh.accepted
