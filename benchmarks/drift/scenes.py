@@ -14,7 +14,7 @@
 
 """Does the drift hold on scenes that nobody drew? Grounds, tools and doses of every kind, five seeds of each.
 
-    python -m benchmarks.drift.scenes [--seeds 5] [--only tool,sparse] [--quick]
+    python -m benchmarks.drift.scenes [--seeds 5] [--only tool,sparse] [--quick] [--time]
 
 A scene is drawn once on a torus, without anything beyond the Nyquist frequency, and moved by its Fourier transform, so
 that every drift is exact; what moves otherwise is drawn into each frame, and the electrons are counted with Poisson's
@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -412,6 +413,35 @@ def run(kind: Kind, seed: int) -> Outcome:
     return Outcome(np.array([u.accepted for u in updates]), errors, scores, bound)
 
 
+def time_frames(names: Sequence[str], seed: int) -> Floats:
+    """(kinds, FRAMES) processor time of each frame, s; the scenes take turns, frame by frame."""
+    scenes = [draw(KINDS[name], seed)[0] for name in names]
+    trackers = [DriftTracker() for _ in names]
+    times = np.zeros((len(names), FRAMES))
+    for k in range(FRAMES):
+        for j, (frames, tracker) in enumerate(zip(scenes, trackers, strict=True)):
+            begin_s = time.thread_time()
+            tracker.update(frames[k], float(k))
+            times[j, k] = time.thread_time() - begin_s
+    return times
+
+
+def show_times(names: Sequence[str], seeds: int) -> None:
+    """Time of a frame over that of plain gold: mean of all frames, and median of those after the first five."""
+    cv2.setNumThreads(1)
+    names = ["gold", *(name for name in names if name != "gold")]
+    times = [time_frames(names, 100 + seed) for seed in range(seeds)]
+    means = np.array([t.mean(axis=1) for t in times])
+    medians = np.array([np.median(t[:, 5:], axis=1) for t in times])
+    rows: list[list[object]] = []
+    for j, name in enumerate(names):
+        ratios = [float(np.mean(t[:, j] / t[:, 0])) for t in (means, medians)]
+        worst = float(np.max(means[:, j] / means[:, 0]))
+        rows.append([name, 1e3 * float(means[:, j].mean()), ratios[0], worst, ratios[1]])
+    header = ["scene", "ms per frame", "over gold", "of the worst seed", "of medians"]
+    show("processor time of a frame", header, rows)
+
+
 def draw_figure(name: str, seed: int, chosen: Sequence[int], path: str) -> None:
     """Write pictures of a scene, as they come, with outlines of what was found to move by itself."""
     frames, _, _ = draw(KINDS[name], seed)
@@ -438,11 +468,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="kinds, separated by commas")
     parser.add_argument("--quick", action="store_true", help="one seed")
     parser.add_argument("--figure", help="write the figure of the documentation instead")
+    parser.add_argument("--time", action="store_true", help="the time of a frame instead")
     chosen = parser.parse_args(arguments)
     if chosen.figure:
         draw_figure("tool over gold", 100, (0, 9, 18, 29), chosen.figure)
         return 0
     names = [n.strip() for n in chosen.only.split(",") if n.strip()] or list(KINDS)
+    if chosen.time:
+        show_times(names, 1 if chosen.quick else chosen.seeds)
+        return 0
     rows: list[list[object]] = []
     failed = False
     for name in names:

@@ -178,9 +178,22 @@ class MotionCorrector:
         """
         if frame.fixed is None:
             return None
+        if not self._resamples(frame, motion, turn):
+            return frame.fixed
         drawn = replace(frame, image=np.where(frame.fixed, np.float32(1.0), np.float32(0.0)))
         image, _ = self.corrected_image(drawn, motion, turn, turn_rate)
         return np.asarray(np.asarray(image, dtype=np.float32) > FIXED_PART_MAX)
+
+    @staticmethod
+    def _resamples(frame: ScanFrame, motion: Array, turn: Array | None) -> bool:
+        """Whether a corrected image is another one than that of the frame."""
+        is_raw = frame.camera is not None and not frame.rectified
+        is_turned = turn is not None and bool(np.any(turn))
+        return (
+            is_raw
+            or is_turned
+            or float(np.max(_max_displacement_px(frame, motion))) > NEGLIGIBLE_PX
+        )
 
 
 def _turned(

@@ -61,6 +61,9 @@ class Keyframe:
         (2,) rotation and scale that were removed from the first frame.
     fixed
         (h, w) True at pixels of the mean that do not show the specimen; None where all do.
+    compared
+        Number of frames in the mean when it was last compared with the first of them
+        (:func:`~semcal_ros.core.drift.matching.free_of_pull`).
     """
 
     frame: ScanFrame
@@ -71,6 +74,7 @@ class Keyframe:
     averaged: int = 1
     turn: Array = field(default_factory=lambda: np.zeros(2))
     fixed: Mask | None = None
+    compared: int = 0
 
     @property
     def nbytes(self) -> int:

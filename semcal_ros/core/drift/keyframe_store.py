@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from semcal_ros.core.drift.keyframe import Keyframe, resample_keyframe, scale_ra
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import (
     CHANGE_MARGIN,
+    MASKED_MAX,
     MEAN_COUNTS,
     MERGED_OVERLAP_MIN,
     SAME_SCALE,
@@ -68,12 +70,27 @@ class PreparedReference:
         """Whether it still is good enough for a keyframe: that has not become much better, or another one."""
         mine = self.keyframe
         return (
-            key == self.key
+            self.is_of(key, keyframe)
             and keyframe.averaged >= mine.averaged
-            and keyframe.frame is mine.frame
-            and np.array_equal(keyframe.removed, mine.removed)
             and not (keyframe.averaged in MEAN_COUNTS and keyframe.averaged > mine.averaged)
         )
+
+    def is_of(self, key: int, keyframe: Keyframe) -> bool:
+        """Whether it was made of the first frame of a keyframe, and of others at most."""
+        mine = self.keyframe
+        return (
+            key == self.key
+            and keyframe.frame is mine.frame
+            and np.array_equal(keyframe.removed, mine.removed)
+        )
+
+    def masked(self, keyframe: Keyframe) -> PreparedReference:
+        """The same without the pixels that a keyframe of the same picture leaves out; they still show in the search
+        over all shifts.
+        """
+        left, top, right, bottom = self.reference.region
+        fixed = None if keyframe.fixed is None else keyframe.fixed[top:bottom, left:right]
+        return PreparedReference(self.key, keyframe, replace(self.reference, fixed=fixed))
 
 
 @dataclass(frozen=True)
@@ -95,6 +112,8 @@ class KeyframeStore:
         The latest reference.
     resampled
         The latest reference of another scale, and the frame whose camera would show it so.
+    single
+        The latest reference of the first frame of a keyframe alone.
     """
 
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
@@ -103,6 +122,7 @@ class KeyframeStore:
     following: int = 0
     prepared: PreparedReference | None = None
     resampled: tuple[PreparedReference, ScanFrame] | None = None
+    single: PreparedReference | None = None
 
     def __getitem__(self, key: int) -> Keyframe:
         return self.keyframes[key]
@@ -171,16 +191,44 @@ class KeyframeStore:
         """Replace a keyframe under the same number."""
         return replace(self, keyframes={**self.keyframes, key: keyframe})
 
+    def clean(self, key: int, single: Keyframe) -> KeyframeStore:
+        """Replace a keyframe by its first frame alone, of which more is left out than before. A reference of that frame
+        is kept, without these pixels, if they are few.
+        """
+        store, old, latest = self.replace(key, single), self.keyframes[key], self.single
+        if latest is None or old.fixed is None or single.fixed is None:
+            return store
+        newly = single.fixed & ~old.fixed
+        if not latest.is_of(key, old) or float(np.mean(newly)) > MASKED_MAX:
+            return store
+        latest = latest.masked(single)
+        return replace(store, prepared=latest, single=latest)
+
     def reference(
         self, key: int, settings: RegistrationSettings
     ) -> tuple[KeyframeStore, Reference]:
         """The prepared reference of a keyframe, and the store that keeps it until another one is asked for, or until
         the mean has become much better.
         """
-        keyframe, latest = self.keyframes[key], self.prepared
+        keyframe, latest, single = self.keyframes[key], self.prepared, self.single
         if latest is None or not latest.serves(key, keyframe):
             latest = PreparedReference(key, keyframe, keyframe.prepare_reference(settings))
-        return replace(self, prepared=latest), latest.reference
+            if keyframe.averaged == 1 and keyframe.fixed is not None:
+                # What else stays in place moves against the specimen, until it is found.
+                single = latest
+        return replace(self, prepared=latest, single=single), latest.reference
+
+    def single_reference(
+        self, key: int, make: Callable[[], Keyframe], settings: RegistrationSettings
+    ) -> tuple[KeyframeStore, Reference]:
+        """The prepared reference of the first frame of a keyframe, which ``make`` makes a keyframe of, and the store
+        that keeps it: frames are compared with it again whenever the mean has become much better.
+        """
+        keyframe, latest = self.keyframes[key], self.single
+        if latest is None or not latest.is_of(key, keyframe):
+            single = make()
+            latest = PreparedReference(key, single, single.prepare_reference(settings))
+        return replace(self, single=latest), latest.reference
 
     def averaged(self, key: int) -> int:
         """Number of frames in the prepared reference."""

@@ -257,15 +257,27 @@ def free_of_pull(
 
     As long as it had moved by little, it was taken for the specimen, and pulled the frames that were added to a
     mean. Where the first frame of the keyframe asks for another shift than the mean does, all means are given up.
+
+    The difference is one of the two references, whichever frame is compared with both: a mean of the same frames as
+    before is not looked at again.
     """
     key, before = match.candidate.key, match.registration
     old = state.keyframes[key]
-    is_new = state.moving is None or old.averaged in MEAN_COUNTS
-    if before.moving is None or not is_new or match.candidate.rescaled or old.averaged == 1:
+    is_new = old.averaged in MEAN_COUNTS and old.averaged != old.compared
+    if (
+        before.moving is None
+        or not (is_new or state.moving is None)
+        or match.candidate.rescaled
+        or old.averaged == 1
+    ):
         return state, match
-    first = single_keyframe(setup, old.frame, old.removed, old).prepare_reference(
-        setup.settings.registration
+    compared = replace(old, compared=old.averaged)
+    store, first = state.keyframes.replace(key, compared).single_reference(
+        key,
+        lambda: single_keyframe(setup, old.frame, old.removed, old),
+        setup.settings.registration,
     )
+    state = replace(state, keyframes=store)
     found = register(
         first,
         match.image,

@@ -23,7 +23,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.arrays import AnyImage, Mask
 from semcal_ros.core.drift.thresholds import (
     OVERLAY_CLIPPED_MIN,
     OVERLAY_ENLARGED_PX,
@@ -81,18 +81,26 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
 
 
 def remove_overlay(image: AnyImage, overlay: Mask) -> AnyImage:
-    """The picture (h, w) or (h, w, 3) with the mean of what lies around in the place of an overlay."""
-    channels: list[Array] = []
-    seen = (~overlay).astype(np.float32)
+    """The picture (h, w) or (h, w, 3) with the mean of what lies around in the place of an overlay (h, w)."""
+    out = np.array(image)
+    spans = [np.flatnonzero(overlay.any(axis=axis)) for axis in (1, 0)]
+    if not len(spans[0]):
+        return out
+    # Nothing else is read: of a data bar, some rows above it.
+    cut = tuple(
+        slice(max(n[0] - OVERLAY_FILLED_PX, 0), n[-1] + 1 + OVERLAY_FILLED_PX) for n in spans
+    )
+    drawn = overlay[cut]
+    places, seen = np.flatnonzero(drawn), (~drawn).astype(np.float32)
     size = (OVERLAY_FILLED_PX, OVERLAY_FILLED_PX)
-    share = cv2.boxFilter(seen, cv2.CV_32F, size)
-    for channel in np.moveaxis(np.atleast_3d(image), 2, 0):
-        level = channel.astype(np.float32)
-        around = cv2.boxFilter(level * seen, cv2.CV_32F, size) / np.maximum(share, 1e-6)
-        middle = float(level[~overlay].mean()) if np.any(~overlay) else 0.0
-        filled = np.where(share > 1e-3, around, middle)
-        channels.append(np.where(overlay, filled, level))
-    out = np.stack(channels, axis=2).reshape(image.shape)
-    if image.dtype.kind in "iu":
-        out = np.rint(out)
-    return np.asarray(out.astype(image.dtype))
+    share = cv2.boxFilter(seen, cv2.CV_32F, size).take(places)
+    is_near = share > 1e-3
+    for channel in np.moveaxis(np.atleast_3d(out), 2, 0):
+        around = cv2.boxFilter(channel[cut].astype(np.float32) * seen, cv2.CV_32F, size)
+        filled = around.take(places) / np.maximum(share, 1e-6)
+        if not np.all(is_near):
+            others = channel[~overlay]
+            middle = float(others.mean(dtype=np.float64)) if len(others) else 0.0
+            filled = np.where(is_near, filled, middle)
+        channel[cut][drawn] = np.rint(filled) if image.dtype.kind in "iu" else filled
+    return out

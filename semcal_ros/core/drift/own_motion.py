@@ -57,7 +57,11 @@ from semcal_ros.core.drift.thresholds import (
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import MovingTiles, fill_bodies
 from semcal_ros.core.registration.fixed_pixels import grow_mask
-from semcal_ros.core.registration.inverse_compositional import Alignment, align_reweighted
+from semcal_ros.core.registration.inverse_compositional import (
+    Alignment,
+    align_reweighted,
+    shift_of_tiles,
+)
 from semcal_ros.core.registration.noise_spectrum import (
     estimate_noise_variance,
     passed_variance,
@@ -268,21 +272,29 @@ def measure_displacement(
     level = make_level(Pyramid(first), 1, BODY_SMOOTHED_PX)
     if level is None or start is None:
         return None
-    shift, looks, image = start, [], Pyramid(second)
-    mask = evidence
-    for ring in (0, 0, RING_PX):
-        if not ring:
-            mask = inside & fill_bodies(evidence & (pair.compare(shift) < as_ground), BODY_GAP_PX)
-        found = _align(level, image, grow_mask(mask, ring), shift + pair.offset, smoothed)
-        if found is None:
-            return None
-        looks.append(found)
-        if not ring:
-            shift = found.shift_px - pair.offset
-            if np.max(np.abs(shift - start)) > BODY_BEYOND_PX:
-                return None
-    best = looks[1]
-    by_ring = PART_OF_RING * (looks[2].shift_px - best.shift_px)
+    image = Pyramid(second)
+
+    def show_body(shift: Array) -> Mask:
+        return inside & fill_bodies(evidence & (pair.compare(shift) < as_ground), BODY_GAP_PX)
+
+    first_px = _find_shift(level, image, show_body(start), start + pair.offset, smoothed)
+    if first_px is None or np.max(np.abs(first_px - pair.offset - start)) > BODY_BEYOND_PX:
+        return None
+    mask = show_body(first_px - pair.offset)
+    best = _align(level, image, mask, first_px, smoothed)
+    if best is None:
+        return None
+    shift = best.shift_px - pair.offset
+    if np.max(np.abs(shift - start)) > BODY_BEYOND_PX:
+        return None
+    covariance = best.covariance + BODY_FLOOR_PX**2 * np.eye(2)
+    if not _is_body(best, covariance, shift - moved_px, smoothed):
+        # A second look only adds to the covariance.
+        return None
+    with_ring = _find_shift(level, image, grow_mask(mask, RING_PX), best.shift_px, smoothed)
+    if with_ring is None:
+        return None
+    by_ring = PART_OF_RING * (with_ring - best.shift_px)
     covariance = best.covariance + np.diag(by_ring**2 + BODY_FLOOR_PX**2)
     return (shift, covariance) if _is_body(best, covariance, shift - moved_px, smoothed) else None
 
@@ -386,8 +398,7 @@ def _align(
     level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array, smoothed: float
 ) -> Alignment | None:
     """Refine a shift by the pixels of a mask alone."""
-    part = drop_pixels(level, ~mask)
-    counts = np.asarray(part.normal_matrices[..., 3, 3] >= TILE_PIXELS_MIN, dtype=np.float64)
+    part, counts = _keep_pixels(level, mask)
     found = align_reweighted(
         part,
         image,
@@ -398,3 +409,17 @@ def _align(
         looks=False,
     )
     return None if isinstance(found, Rejection) or not found.converged else found
+
+
+def _find_shift(
+    level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array, smoothed: float
+) -> Array | None:
+    """As :func:`_align`, the shift (2,) alone."""
+    part, counts = _keep_pixels(level, mask)
+    return shift_of_tiles(part, image, start_px, counts, smoothed)
+
+
+def _keep_pixels(level: PyramidLevel, mask: Mask) -> tuple[PyramidLevel, Array]:
+    """The pixels of a mask alone, and which tiles (rows, cols) count then."""
+    part = drop_pixels(level, ~mask)
+    return part, np.asarray(part.normal_matrices[..., 3, 3] >= TILE_PIXELS_MIN, dtype=np.float64)

@@ -60,7 +60,8 @@ def clean_keyframes(setup: TrackerSetup, state: TrackerState) -> TrackerState:
         old = state.keyframes[key]
         frame = state.static.remove_from(old.frame)
         if frame is not old.frame:
-            state = remake_keyframe(setup, state, key, frame, old.removed)
+            single = single_keyframe(setup, frame, old.removed, old)
+            state = replace(state, keyframes=state.keyframes.clean(key, single))
     return state
 
 

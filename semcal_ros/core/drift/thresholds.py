@@ -192,6 +192,11 @@ MEAN_COUNTS = TABLE.derived(
     "In a mean at which it replaces the prepared reference: each time its noise variance has halved. From 32 "
     "frames on, it adds 1.5 % to the sigma of a shift, sqrt(1 + 1/32).",
 )
+MASKED_MAX = TABLE.stated(
+    "MASKED_MAX", 0.01, "of the image",
+    "That is newly left out of a reference which is kept otherwise: so few pixels decide on no peak of the search over "
+    "all shifts, in which they show.",
+)
 COMMON_PX_MIN = TABLE.cost(
     "COMMON_PX_MIN", 8, "px",
     "Rows or columns in common; fewer are not added to a mean, which they hardly improve.",

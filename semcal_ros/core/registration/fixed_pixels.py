@@ -56,8 +56,7 @@ def drop_fixed_pixels(
 
     Returns
     -------
-    The reference itself where there is nothing to drop. At coarser resolutions, which only lead to the finest, all
-    pixels count.
+    The reference itself where there is nothing to drop.
     """
     if not reference.levels or (fixed is None and reference.fixed is None):
         return reference
@@ -83,5 +82,18 @@ def drop_fixed_pixels(
         part |= around[max(-y, 0) :, max(-x, 0) :][: part.shape[0], : part.shape[1]]
     if not np.any(dropped):
         return reference
-    levels = (*reference.levels[:-1], drop_pixels(level, dropped))
-    return replace(reference, levels=levels, whole=reference.whole or reference)
+    levels = [drop_pixels(level, dropped)]
+    for coarser in reference.levels[-2::-1]:
+        # What fills their place would pull the start, too, by enough for one more step at full resolution.
+        dropped = _halve(dropped)
+        more = SMEARED_PX + int(np.ceil(coarser.sigma_px)) - reach // coarser.factor
+        levels.insert(0, drop_pixels(coarser, grow_mask(dropped, max(more, 0))))
+    return replace(reference, levels=tuple(levels), whole=reference.whole or reference)
+
+
+def _halve(mask: Mask) -> Mask:
+    """(h // 2, w // 2) the squares of 2 px of a mask (h, w) of which any pixel is True."""
+    height, width = (n // 2 * 2 for n in mask.shape)
+    even, odd = mask[0:height:2, :width], mask[1:height:2, :width]
+    lines = even | odd
+    return np.asarray(lines[:, 0::2] | lines[:, 1::2])

@@ -319,8 +319,8 @@ def unmeasured_alignment() -> Alignment:
 class _Comparison:
     """The pixels of one level compared at one shift; shifts in px of the level.
 
-    ``plain`` are the sums without weights of the tiles, and ``noise`` is the variance per pixel that the squares of the
-    reference in the geometry lack.
+    ``plain`` are the sums without the ``weights`` (rows, cols) of the tiles, and ``noise`` is the variance per pixel
+    that the squares of the reference in the geometry lack.
     """
 
     level: PyramidLevel
@@ -333,6 +333,7 @@ class _Comparison:
     image_size: tuple[int, int]
     mean: float
     noise: float = 0.0
+    weights: Array | None = None
 
     @cached_property
     def tiles(self) -> TileStatistics:
@@ -344,6 +345,15 @@ class _Comparison:
     def expected_variances(self) -> Array:
         """(tiles, 2, 2) covariance of each tile's score as the residuals of its pixels tell it."""
         return _expect_variances(self)
+
+    def weighs_alike(self, window: TileWindow, weights: Array | None) -> bool:
+        """Whether the tiles of a window are those of this comparison, with the same weights."""
+        return (
+            self.weights is not None
+            and weights is not None
+            and self.window.key == window.key
+            and np.array_equal(self.weights, weights)
+        )
 
     @property
     def length(self) -> float:
@@ -472,6 +482,40 @@ def align_reweighted(
     -------
     The alignment, which may not have converged; or a rejection as of :func:`align`.
     """
+    found = _descend(level, image, start_px, weights, noise, reweight, looks)
+    return found if isinstance(found, Rejection) else _summarise(*found)
+
+
+def shift_of_tiles(
+    level: PyramidLevel, image: Pyramid, start_px: Array, weights: Array, noise: float
+) -> Array | None:
+    """(2,) the shift of tiles with weights (rows, cols) as :func:`align_reweighted` finds it, and nothing else; None
+    where it does not converge.
+    """
+    found = _descend(
+        level,
+        image,
+        start_px,
+        weights,
+        noise,
+        lambda tiles: weights[tiles.rows, tiles.cols],
+        looks=False,
+    )
+    if isinstance(found, Rejection) or not found[2]:
+        return None
+    return found[0].improved * level.factor
+
+
+def _descend(
+    level: PyramidLevel,
+    image: Pyramid,
+    start_px: Array,
+    weights: Array,
+    noise: float,
+    reweight: Callable[[TileStatistics], Array],
+    looks: bool,
+) -> tuple[_Comparison, Array, bool, int] | Rejection[MatchFailure]:
+    """The last comparison, its covariance, whether it has converged, and the number of passes."""
     shift, passes = np.asarray(start_px, dtype=np.float64), 0
     weights, converged = weights.copy(), False
     # A bright tool would pull the first step to where it went, or leave none.
@@ -480,10 +524,21 @@ def align_reweighted(
         found = reweight(first)
         if np.count_nonzero(found) >= BLOCKS_MIN:
             weights[first.rows, first.cols] = found
+    latest: _Comparison | None = None
     for passes in range(1, PASSES_MAX + 1):
-        comparison = _compare(level, image, shift / level.factor, None, ALL_PIXELS, weights, noise)
+        comparison = _compare(
+            level,
+            image,
+            shift / level.factor,
+            None,
+            ALL_PIXELS,
+            weights,
+            noise,
+            before=latest,
+        )
         if isinstance(comparison, Rejection):
             return comparison
+        latest = comparison
         statistics = comparison.tiles
         found = reweight(statistics)
         shift = comparison.improved * level.factor
@@ -494,10 +549,10 @@ def align_reweighted(
             if converged:
                 break
         weights[statistics.rows, statistics.cols] = found
-    assert isinstance(comparison, _Comparison)
-    information = comparison.fit.information
-    chance = _find_chance_gradient(comparison.level, comparison.geometry, information, ALL_PIXELS)
-    return chance or _summarise(comparison, covariance, converged, passes)
+    assert latest is not None
+    information = latest.fit.information
+    chance = _find_chance_gradient(latest.level, latest.geometry, information, ALL_PIXELS)
+    return chance or (latest, covariance, converged, passes)
 
 
 def _compare(
@@ -509,10 +564,12 @@ def _compare(
     weights: Array | None = None,
     noise: float = 0.0,
     held: Array | None = None,
+    before: _Comparison | None = None,
 ) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
     comparison, None to compute it from enough pixels. ``weights`` (rows, cols) are those of the reference's tiles, and
-    ``noise`` the variance of its smoothed pixels. ``held`` is as for :func:`align`.
+    ``noise`` the variance of its smoothed pixels. ``held`` is as for :func:`align`. What a comparison ``before`` of the
+    same level and noise has of the same tiles with the same weights is not computed again.
     """
     pixels = image.centred(level.factor)
     size = pixels.shape[1], pixels.shape[0]
@@ -522,8 +579,11 @@ def _compare(
         reason = f"too little overlap ({100.0 * shared:.0f} % of the image)"
         return Rejection(MatchFailure.TOO_LITTLE_OVERLAP, reason)
     if weights is not None:
-        weights = weights[window.rows, window.cols]
-    geometry = prepare_geometry(level, window, weights, noise)
+        weights = weights[window.rows, window.cols].copy()
+    if before is not None and before.weighs_alike(window, weights):
+        geometry = before.geometry
+    else:
+        geometry = prepare_geometry(level, window, weights, noise)
     sums = tile_sums(level, window, pixels, shift, hessian, enough, weights)
     plain = sums
     if weights is not None:
@@ -535,7 +595,9 @@ def _compare(
             MatchFailure.UNDETERMINED, _FEATURELESS
         )
     lacks = 0.0 if weights is None else noise
-    return _Comparison(level, window, geometry, sums, plain, fit, shift, size, image.mean, lacks)
+    return _Comparison(
+        level, window, geometry, sums, plain, fit, shift, size, image.mean, lacks, weights
+    )
 
 
 def _find_chance_gradient(

@@ -445,7 +445,9 @@ def _compute_curvature(
 ) -> _Curvature:
     columns = slice(0, level.products.shape[1]) if cols is None else cols
     (side_x, side_y), band = level.side, band_of(level.sigma_px)
-    tiles = level.products[rows, columns][picked, :, :2]
+    # Of all rows, nothing is copied.
+    chosen = picked if len(picked) < rows.stop - rows.start else slice(None)
+    tiles = level.products[rows, columns][chosen, :, :2]
     count, across = tiles.shape[:2]
     planes = tiles.reshape(count, across, 2, side_y, side_x).transpose(2, 0, 3, 1, 4)
     slopes = np.ascontiguousarray(planes).reshape(2, count * side_y, across * side_x)
@@ -456,6 +458,10 @@ def _compute_curvature(
     energy = np.einsum("kic,kic->kc", slopes, slopes).reshape(2, across, side_x)
     xx, xy = gradients_transposed(slopes[0], band)
     yx, yy = gradients_transposed(slopes[1], band)
-    second = np.stack([xx, 0.5 * (xy + yx), yy]).reshape(3, count, side_y, across, side_x)
-    weights = np.ascontiguousarray(second.transpose(0, 3, 1, 2, 4)).reshape(3, across, -1)
-    return _Curvature(picked, weights, energy.sum(axis=2, dtype=np.float64).T, columns.start)
+    xy += yx
+    xy *= np.float32(0.5)
+    weights = np.empty((3, across, count, side_y, side_x), dtype=np.float32)
+    for weight, second in zip(weights, (xx, xy, yy), strict=True):
+        weight[:] = second.reshape(count, side_y, across, side_x).transpose(2, 0, 1, 3)
+    flat = weights.reshape(3, across, -1)
+    return _Curvature(picked, flat, energy.sum(axis=2, dtype=np.float64).T, columns.start)

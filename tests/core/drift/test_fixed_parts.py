@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -26,14 +28,21 @@ from semcal_ros.core.drift.fixed_parts import (
     find_fixed_parts,
     share_of_gradients,
 )
+from semcal_ros.core.drift.frame import ScanFrame
+from semcal_ros.core.drift.keyframe import Keyframe, make_keyframe
+from semcal_ros.core.drift.keyframe_store import KeyframeStore
+from semcal_ros.core.drift.overlay import remove_overlay
 from semcal_ros.core.drift.thresholds import (
     FIXED_MOVE_PX_MIN,
 )
 from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.registration.reference import Reference, RegistrationSettings
+from semcal_ros.core.registration.register import register
 from tests.helpers.drift_scenes import Texture
 
 SIZE = 224
 GROUND = Texture(5)
+EYE = np.eye(2)
 SCALE = 30.0 / float(GROUND.view((0.0, 0.0), SIZE).std())
 
 
@@ -115,6 +124,51 @@ def test_burnt_spots_do_not_hold_the_drift() -> None:
     # Without, they are off by 0.2 px and more, at a stated 0.03 px.
     assert np.max(np.abs(errors)) < 0.05
     assert np.all(np.abs(errors) < 4.0 * np.array(sigmas))
+
+
+def test_a_reference_is_kept_where_little_more_of_it_is_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings, plain = RegistrationSettings(), picture((0.0, 0.0), 0)
+    prepared = []
+    prepare = Keyframe.prepare_reference
+
+    def count(keyframe: Keyframe, given: RegistrationSettings) -> Reference:
+        prepared.append(keyframe)
+        return prepare(keyframe, given)
+
+    monkeypatch.setattr(Keyframe, "prepare_reference", count)
+
+    def keyframe(fixed: Mask) -> Keyframe:
+        frame = ScanFrame(remove_overlay(plain, fixed), None, None, fixed=fixed)
+        region = (0, 0, SIZE, SIZE)
+        return make_keyframe(frame, np.zeros(4), frame.image, region, 0.0, fixed=fixed)
+
+    some, more = spots(), spots()
+    some[40:60, 40:60] = False
+    more[40:60, 40:60] = True
+    store, before = KeyframeStore().add(keyframe(some)).reference(0, settings)
+    # A few pixels are left out of what was prepared; it is that of the new keyframe then.
+    store, reference = store.clean(0, keyframe(more)).reference(0, settings)
+    assert len(prepared) == 1
+    assert reference.levels is before.levels
+    np.testing.assert_array_equal(reference.fixed, more)
+    # Many would decide where the search goes.
+    many = more.copy()
+    many[100:130] = True
+    store, reference = store.clean(0, keyframe(many)).reference(0, settings)
+    assert len(prepared) == 2
+    np.testing.assert_array_equal(reference.fixed, many)
+    # A shift is the same as with one that was prepared anew, to a tenth of its sigma.
+    image = remove_overlay(picture((2.3, -1.4), 1), more)
+    fresh, kept = (
+        register(one, image, guess_px=(2.0, -1.0), guess_covariance=EYE, fixed=more)
+        for one in (keyframe(more).prepare_reference(settings), replace(before, fixed=more))
+    )
+    assert fresh.accepted
+    assert kept.accepted
+    sigma = np.sqrt(np.diag(fresh.covariance))
+    assert np.all(np.abs(kept.shift_px - fresh.shift_px) < 0.1 * sigma)
 
 
 def test_contrast_of_a_mean_does_not_grow() -> None:

@@ -23,6 +23,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.drift.overlay import remove_overlay
 from semcal_ros.core.registration.fixed_pixels import drop_fixed_pixels, grow_mask
 from semcal_ros.core.registration.noise_spectrum import smooth
 from semcal_ros.core.registration.register import prepare_reference, register
@@ -178,3 +179,25 @@ def test_masks_grow_and_nothing_is_dropped_where_nothing_is_fixed() -> None:
     part = drop_fixed_pixels(replace(reference, fixed=away), None, region, np.zeros(2))
     assert part.whole is reference or part.whole is not None
     assert part.levels[-1].dropped is not None
+
+
+def test_what_fills_a_place_does_not_cost_another_step() -> None:
+    # Of twice the size, so that there is a coarser level, whose start it would pull.
+    size, shift = 2 * SIZE, np.array([1.3, -0.8])
+    bar = np.zeros((size, size), dtype=bool)
+    bar[-60:] = True
+    pair = []
+    for k, at in enumerate((np.zeros(2), shift)):
+        clean = 110.0 + SCALE * GROUND.view(tuple(at), size)
+        noisy = np.random.default_rng(k).normal(clean, NOISE)
+        pair.append(remove_overlay(np.rint(noisy.clip(0, 255)).astype(np.uint8), bar))
+    reference = prepare_reference(pair[0], fixed=bar)
+    part = drop_fixed_pixels(reference, bar, None, shift)
+    assert len(part.levels) > 1
+    for level in part.levels:
+        assert level.dropped is not None
+        # The bar, and some pixels above it.
+        assert 0.9 < level.dropped.mean() * size / 60.0 < 1.4
+    found = register(reference, pair[1], guess_px=shift, guess_covariance=np.eye(2), fixed=bar)
+    assert found.accepted
+    assert found.alignment.iterations <= 1 + len(part.levels) - 1
