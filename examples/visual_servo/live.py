@@ -27,12 +27,11 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
@@ -52,7 +51,9 @@ from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.synthetic import VirtualMicroscope
 
 NODES = ("parameter_server", "stream_corrector", "visual_servo", "virtual_sem")
-START_S, STAGE_S, DRIVE_S = 60.0, 90.0, 2.0
+START_S, STAGE_S = 180.0, 90.0
+# Nearer than this the stage is where it was sent.
+ARRIVED_M = 1e-7
 # Frames at a magnification after it has converged there.
 HELD = 6
 # Frames after a change of the magnification that are waited for first.
@@ -92,12 +93,19 @@ class Suite:
         self._executor.add_node(self._node)
         self.images: dict[int, np.ndarray] = {}
         self.states: dict[str, dict[str, str]] = {}
+        self.joints: dict[str, float] = {}
         queue = QoSProfile(depth=50)
         self._subscriptions = [
             self._node.create_subscription(Image, "image_raw", self._on_image, queue),
             self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, queue),
+            self._node.create_subscription(
+                JointState,
+                "stage",
+                self._on_stage,
+                QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+            ),
         ]
-        self.stage = self._node.create_publisher(Twist, "virtual_sem/stage", queue)
+        self._move = self._node.create_publisher(JointState, "virtual_sem/move_stage", queue)
         self._start = self._node.create_client(Trigger, "visual_servo/start")
         self._set = self._node.create_client(SetParameters, "virtual_sem/set_parameters")
         self.knob = self._node.create_publisher(Float64, "virtual_sem/set_magnification", queue)
@@ -109,6 +117,9 @@ class Suite:
         for status in message.status:
             node = status.name.partition(":")[0].rpartition("/")[2]
             self.states[node] = {value.key: value.value for value in status.values}
+
+    def _on_stage(self, message: JointState) -> None:
+        self.joints = dict(zip(message.name, message.position, strict=True))
 
     def close(self) -> None:
         """End the nodes, the servo before the microscope."""
@@ -128,18 +139,24 @@ class Suite:
         return True
 
     def begin(self, travel_m: tuple[float, float]) -> None:
-        """Drive the stage away from where it is, then let the servo take over."""
+        """Move the stage away from where it is, then let the servo take over."""
         ready = (
-            lambda: self.stage.get_subscription_count() and self.knob.get_subscription_count(),
-            lambda: self._start.service_is_ready() and len(self.images) > 2,
+            lambda: self._move.get_subscription_count() and self.knob.get_subscription_count(),
+            lambda: self._start.service_is_ready() and len(self.images) > 2 and self.joints,
         )
         if not all(self.spin_until(condition, START_S) for condition in ready):
             raise RuntimeError("the nodes were not found")
-        twist = Twist()
-        twist.linear.x, twist.linear.y = (way / DRIVE_S for way in travel_m)
-        self.stage.publish(twist)
-        self.spin_until(lambda: False, DRIVE_S)
-        self.stage.publish(Twist())
+        # Not by a velocity for some seconds: on a machine with other work they are more, and the target is lost.
+        target = {
+            joint: self.joints[joint] + way for joint, way in zip(("x", "y"), travel_m, strict=True)
+        }
+        self._move.publish(JointState(name=list(target), position=list(target.values())))
+
+        def has_arrived() -> bool:
+            return all(abs(self.joints[name] - at) < ARRIVED_M for name, at in target.items())
+
+        if not self.spin_until(has_arrived, START_S):
+            raise RuntimeError("the stage did not move")
         answer = self._start.call_async(Trigger.Request())
         self.spin_until(answer.done, START_S)
 
@@ -178,39 +195,53 @@ def live(
     suite = Suite(folder, preset, drift, seed, goal)
     try:
         suite.begin(travel_m)
-        for g in magnifications:
+        for k, g in enumerate(magnifications):
             began, first = time.monotonic(), len(suite.images)
             suite.knob.publish(Float64(data=g))
             # What is told right after the change may be of the frames before it.
             suite.spin_until(lambda count=first + CHANGING: len(suite.images) >= count, STAGE_S)
             reached = suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
-            if with_tip:
+            entered, share = None, math.nan
+            if with_tip and reached:
+                entered = len(suite.images) - first
                 for part in TIP:
                     suite.set_tip(part)
                     count = len(suite.images) + TIP_FRAMES
                     suite.spin_until(lambda count=count: len(suite.images) >= count, STAGE_S)
                 share = float(suite.states["stream_corrector"].get("drift_moving_share", "nan"))
                 # It holds what it has, with the tip in the picture.
-                reached &= suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
+                reached = suite.spin_until(lambda value=g: suite.converged_at(value), STAGE_S)
             if not reached:
                 missed.append(g)
             frames = len(suite.images) - first
             held = len(suite.images) + HELD
             suite.spin_until(lambda count=held: len(suite.images) >= count, STAGE_S)
-            seen = _judged(run, suite, microscope, goal, g, first)
+            errors_px = _judged(run, suite, microscope, goal, g, first)
             own = suite.states.get("visual_servo", {})
+            is_seen = bool(np.any(np.isfinite(errors_px[-HELD:])))
+            with_tip_px = errors_px[entered:]
             print(
                 f"{g:6g}x {'converged' if reached else 'NOT converged'} after {frames:2} frames,"
-                f" {time.monotonic() - began:4.0f} s; own error {float(own['servo_error_px']):.3f} px;"
+                f" {time.monotonic() - began:4.0f} s; own error {float(own['servo_error_px']):.3f}"
+                f" +- {float(own['servo_sigma_px']):.3f} px;"
                 + (
                     f" truth {run.true_px[-1]:.3f} px, {1e9 * run.true_m()[-1]:.1f} nm"
-                    if any(seen[-HELD:])
+                    if is_seen
                     else f" truth not seen in the last {HELD} frames"
                 )
                 + f"; resets {own['servo_resets']}"
-                + (f"; tip left out of {100.0 * share:.0f} % of the field" if with_tip else ""),
+                + (
+                    f"; tip left out of {100.0 * share:.0f} % of the field, in {len(with_tip_px)} frames with it at"
+                    f" most {np.nanmax(with_tip_px):.3f} px off"
+                    if entered is not None and np.any(np.isfinite(with_tip_px))
+                    else ""
+                ),
                 flush=True,
             )
+            if not reached and not is_seen:
+                # Nothing brings the target back into view.
+                missed += magnifications[k + 1 :]
+                break
             if with_tip:
                 suite.set_tip(0.0)
     finally:
@@ -223,27 +254,28 @@ def live(
 
 def _judged(
     run: Run, suite: Suite, microscope: VirtualMicroscope, goal: PlanePose, g: float, first: int
-) -> list[bool]:
-    """Where the target was in the frames since the last change, by the true microscope; mixed frames fail.
+) -> np.ndarray:
+    """Where the target was in the frames since the last change, by the true microscope.
 
-    Returns whether each of these frames showed it.
+    Returns how far it was from its place in each of them, px; NaN where it was not seen, as in mixed frames.
     """
     camera = microscope.camera_at(g)
-    seen = []
+    errors_px = []
     rectifier, plane = Rectifier("cubic"), PlaneCamera.from_camera(camera)
     for stamp in list(suite.images)[first:]:
         image = suite.images[stamp]
         view = find_target(rectifier.rectify(image, camera), NestedTarget())
         fit = fit_pose(without_residual(view, microscope, g), plane)
-        seen.append(fit.accepted and abs(fit.scale - 1.0) <= 0.02)
-        if not seen[-1]:
+        if not fit.accepted or abs(fit.scale - 1.0) > 0.02:
+            errors_px.append(math.nan)
             continue
         error = fit.pose.minus(goal)
+        errors_px.append(float(np.hypot(*(camera.ideal_from_sem_jacobian @ error[:2]))))
         run.magnification.append(g)
         run.true_error.append(error)
-        run.true_px.append(float(np.hypot(*(camera.ideal_from_sem_jacobian @ error[:2]))))
+        run.true_px.append(errors_px[-1])
         run.images[g] = image
-    return seen
+    return np.array(errors_px)
 
 
 def without_residual(view: TargetView, microscope: VirtualMicroscope, g: float) -> TargetView:

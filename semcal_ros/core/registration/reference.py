@@ -23,7 +23,7 @@ from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
 from semcal_ros.core.registration.one_direction import OneDirection, find_direction
-from semcal_ros.core.registration.periodicity import find_periods
+from semcal_ros.core.registration.periodicity import find_periods, find_repeating
 from semcal_ros.core.registration.thresholds import (
     COMPETING_HEIGHT_MIN,
     CORRELATION_MIN,
@@ -147,3 +147,13 @@ class Reference:
         if self.whole is not None:
             return self.whole.periods
         return find_periods(self.coarse.pyramid.centred(1), self.noise_variance)
+
+    @cached_property
+    def repeats(self) -> Mask:
+        """(h, w) of its region, where it shows its lattice; there must be :attr:`periods`."""
+        if self.whole is not None:
+            return self.whole.repeats
+        level = self.levels[-1]
+        return find_repeating(
+            self.coarse.pyramid.centred(1), self.periods, level.sigma_px, max(level.side)
+        )

@@ -20,7 +20,7 @@ therefore accepted only if the two stages agree, the halves of the overlap agree
 most of their structure in common, and no competing shift explains the image as well.
 
 Where not all of the image moves by one shift, the specimen is what moves as predicted, or nearly all of the structure
-(:mod:`.specimen`); the rest is left out. A periodic specimen is registered by its defects (:mod:`.periodicity`).
+(:mod:`.specimen`); the rest is left out. A periodic specimen is registered by its defects (:mod:`.defects`).
 
 Of lines in one direction only the shift across them is measured (:mod:`.one_direction`).
 
@@ -40,6 +40,7 @@ from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.acceptance import find_failure
 from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.ambiguity import choose_peak, compare_residuals
+from semcal_ros.core.registration.defects import ChosenShift, choose_period
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.fixed_pixels import drop_fixed_pixels
 from semcal_ros.core.registration.inverse_compositional import (
@@ -62,11 +63,13 @@ from semcal_ros.core.registration.normalised_correlation import (
     find_coarse_peaks,
 )
 from semcal_ros.core.registration.one_direction import OneDirection, align_across
-from semcal_ros.core.registration.periodicity import choose_period
+from semcal_ros.core.registration.periodicity import find_repeating, is_fine
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.specimen import (
+    find_moving,
     keep_specimen,
     look_at_whole,
+    noise_beside_tools,
     refuse_unless_followed,
 )
 from semcal_ros.core.registration.thresholds import (
@@ -504,8 +507,11 @@ def _register(
     image_region: Region | None,
     max_shear_px: float,
     suspected: MovingTiles | None,
+    by_defects: bool = False,
 ) -> Registration:
-    """Measure a shift in both directions."""
+    """Measure a shift in both directions; of what repeats, by its defects where several shifts stand out, or where
+    ``by_defects`` says so.
+    """
     gray, inside = _crop(image, image_region)
     if reference.defect:
         return _reject(MatchFailure.UNUSABLE_REFERENCE, f"reference: {reference.defect}")
@@ -516,6 +522,7 @@ def _register(
     guess = np.asarray(guess_px, dtype=np.float64) - origin
     pyramid = Pyramid(gray)
     moving: MovingTiles | None = None
+    share = 1.0
     of_parts = reference.is_sparse or suspected is not None
     peaks = find_coarse_peaks(reference.coarse, pyramid, guess)
     if not peaks:
@@ -524,8 +531,7 @@ def _register(
             MatchFailure.NO_PEAK, found or "no shift stands out: featureless, or another place"
         )
     spread = None if guess_covariance is None else np.asarray(guess_covariance, dtype=np.float64)
-    least = reference.settings.min_competing_height * peaks[0].correlation
-    repeats = len(peaks) > 1 and peaks[1].correlation >= least and len(reference.periods) > 0
+    repeats = by_defects or _shows_lattice(reference, peaks)
     follow_px = reference.settings.follow_px((np.shape(image)[1], np.shape(image)[0]), inside)
     if repeats and follow_px is not None:
         # What moves otherwise would choose the period, and the lattice agrees with any.
@@ -536,15 +542,36 @@ def _register(
     chosen: tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]
     if repeats:
         finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True) or peaks
+        # Periods are not known well enough to be counted far.
+        high = reference.settings.min_competing_height * finest[0].correlation
+        start = min(
+            (p for p in finest if p.correlation >= high),
+            key=lambda p: float(np.hypot(*(np.array(p.shift_px) - guess))),
+        )
         told = choose_period(
             reference.levels,
             pyramid,
             reference.periods,
-            np.array(finest[0].shift_px),
+            np.array(start.shift_px),
             guess,
             spread,
+            noise_beside_tools(reference, pyramid),
+            (
+                reference.repeats,
+                find_repeating(
+                    pyramid.centred(1),
+                    reference.periods,
+                    reference.levels[-1].sigma_px,
+                    max(reference.levels[-1].side),
+                ),
+            ),
         )
-        chosen = told if isinstance(told, Rejection) else (_peak_at(finest[0], told), told)
+        if isinstance(told, ChosenShift):
+            chosen = _peak_at(start, told.alignment), told.alignment
+            moving = find_moving(reference, told.alignment, told.agreement)
+            share = told.agreement.share
+        else:
+            chosen = told
     elif of_parts:
         chosen = peaks[0], None
     else:
@@ -566,7 +593,20 @@ def _register(
     # A tile with a defect is no tile that moves.
     whole = None if repeats or of_parts else look_at_whole(reference, alignment, image_noise)
     kept = None
-    if not repeats and (whole is None or not whole.is_complete):
+    is_part = not repeats and (whole is None or not whole.is_complete)
+    if is_part and _has_fine_lattice(reference):
+        # A tool that outshines a lattice stands out alone.
+        return _register(
+            reference,
+            image,
+            guess_px=guess_px,
+            guess_covariance=guess_covariance,
+            image_region=image_region,
+            max_shear_px=max_shear_px,
+            suspected=suspected,
+            by_defects=True,
+        )
+    if is_part:
         if suspected is not None:
             suspected = replace(suspected, corner_px=suspected.corner_px - np.array(inside[:2]))
         kept = keep_specimen(
@@ -576,7 +616,8 @@ def _register(
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(distances))].shift_px) + origin
         return Registration(unmeasured_alignment(), float("nan"), chosen, nearest)
-    share = 1.0 if whole is None else whole.share
+    if whole is not None:
+        share = whole.share
     if kept is not None:
         alignment, peak, moving, share = kept
     if moving is not None:
@@ -642,6 +683,18 @@ def _align_at_finest(
         return peak, before
     levels = [level for level in reference.levels if level.factor <= finest[0].step_px]
     return finest[0], align(levels, pyramid, np.array(finest[0].shift_px))
+
+
+def _has_fine_lattice(reference: Reference) -> bool:
+    return len(reference.periods) > 0 and is_fine(reference.periods, reference.levels[-1].size)
+
+
+def _shows_lattice(reference: Reference, peaks: list[CoarsePeak]) -> bool:
+    """Whether several shifts stand out, as those of a lattice do; of a fine one, even where a tool outshines it."""
+    if len(peaks) < 2 or not len(reference.periods):
+        return False
+    least = reference.settings.min_competing_height * peaks[0].correlation
+    return peaks[1].correlation >= least or _has_fine_lattice(reference)
 
 
 def _peak_at(peak: CoarsePeak, alignment: Alignment) -> CoarsePeak:

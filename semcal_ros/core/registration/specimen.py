@@ -96,10 +96,7 @@ def keep_specimen(
     What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part; ``suspected`` is
     where something moved otherwise in the image before.
     """
-    level = reference.levels[-1]
-    noise = TileNoise.of(
-        level.sigma_px, reference.noise_variance, _estimate_least_noise(pyramid.full)
-    )
+    level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
     first = information_weights(
         level.normal_matrices[..., :2, :2],
         level.pixel_counts,
@@ -156,14 +153,11 @@ def keep_specimen(
         best = _choose_hypothesis(found, guess, spread)
     if isinstance(best, Rejection):
         return best, peak, None, 0.0
-    statistics = best.alignment.tile_statistics()
-    assert statistics is not None
-    moving = _moving_tiles(reference, statistics, best)
-    shown = moving if moving.share > 0.0 else None
+    moving = find_moving(reference, best.alignment, best.agreement)
     share = best.agreement.share
     if follow_px is not None:
         share = _share_inside(best.alignment, best.agreement, reference, follow_px)
-    return best.alignment, best.start, shown, share
+    return best.alignment, best.start, moving, share
 
 
 class _Judge:
@@ -275,12 +269,16 @@ def _is_near(alignment: Alignment, guess: Array, spread: Array) -> bool:
     return float(innovation @ np.linalg.solve(covariance, innovation)) <= NEAR_CHI2_MAX
 
 
-def _moving_tiles(
-    reference: Reference, statistics: TileStatistics, found: _Hypothesis
-) -> MovingTiles:
+def find_moving(
+    reference: Reference, alignment: Alignment, agreement: Agreement
+) -> MovingTiles | None:
+    """What does not agree with an alignment; None where all does."""
+    statistics = alignment.tile_statistics()
+    assert statistics is not None
     side = np.array(reference.levels[-1].side, dtype=np.float64)
-    corner = _first_corner(reference, statistics, found.alignment)
-    return MovingTiles.of(found.agreement.disagrees, corner, side)
+    corner = _first_corner(reference, statistics, alignment)
+    moving = MovingTiles.of(agreement.disagrees, corner, side)
+    return moving if moving.share > 0.0 else None
 
 
 def _first_corner(reference: Reference, statistics: TileStatistics, alignment: Alignment) -> Array:
@@ -288,6 +286,12 @@ def _first_corner(reference: Reference, statistics: TileStatistics, alignment: A
     level = reference.levels[-1]
     first = np.array([statistics.cols.start, statistics.rows.start])
     return np.array(level.origin) + first * np.array(level.side) + alignment.shift_px
+
+
+def noise_beside_tools(reference: Reference, pyramid: Pyramid) -> TileNoise:
+    """Noise of a reference and of an image in which something may have come in."""
+    image = _estimate_least_noise(pyramid.full)
+    return TileNoise.of(reference.levels[-1].sigma_px, reference.noise_variance, image)
 
 
 def _estimate_least_noise(image: AnyImage) -> float:

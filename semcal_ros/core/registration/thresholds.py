@@ -276,11 +276,15 @@ COMMON_TILES_MIN = TABLE.derived(
     "is not.",
 )
 
-# Periodic specimens, in periodicity.py
+# Periodic specimens, in periodicity.py and defects.py
 
 PERIODS_SIDE_PX_MAX = TABLE.cost(
     "PERIODS_SIDE_PX_MAX", 512, "px",
     "Side of the part of an image in which periods are looked for.",
+)
+SOFTENED_PX = TABLE.stated(
+    "SOFTENED_PX", 24, "px",
+    "Side of the squares in which contrast is measured before periods are looked for: fine lattices repeat in one.",
 )
 PERIOD_PX_MIN = TABLE.stated(
     "PERIOD_PX_MIN", 4.0, "px",
@@ -305,6 +309,22 @@ PERIODS_COMPARED_MAX = TABLE.cost(
 PERIODS_REACH_SIGMAS = TABLE.derived(
     "PERIODS_REACH_SIGMAS", 4.0, "sigma",
     "Within which a shift is predicted: beyond are one in 3000, exp(-4^2 / 2).",
+)
+REPEATING_PERIODS = TABLE.stated(
+    "REPEATING_PERIODS", 1.5, "periods",
+    "Least side of the squares in which an image repeats or does not.",
+)
+REPEATING_POWER = TABLE.stated(
+    "REPEATING_POWER", 0.25, "of the typical power",
+    "That a square has in common with those a period away where it shows the lattice: half of its contrast.",
+)
+REPEATING_SIGMAS = TABLE.stated(
+    "REPEATING_SIGMAS", 1.5, "of the RMS contrast",
+    "At which grey levels are cut off before: a wave reaches 1.4 of its own.",
+)
+REPEATING_TYPICAL = TABLE.stated(
+    "REPEATING_TYPICAL", 0.75, "of the image",
+    "With less power than the typical one: that of the lattice also where half of the field shows something else.",
 )
 DEFECT_SIGMAS = TABLE.derived(
     "DEFECT_SIGMAS", 5.0, "robust sigma",

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.registration.periodicity import find_periods
+from semcal_ros.core.registration.periodicity import find_periods, find_repeating
 from tests.helpers.drift_scenes import Texture
 
 SIZE = 256
@@ -65,3 +65,33 @@ def test_a_texture_does_not_repeat(seed: int) -> None:
     texture = 40.0 * Texture(seed).view((0.0, 0.0), SIZE)
     noise = np.random.default_rng(seed).normal(size=texture.shape)
     assert len(find_periods(np.asarray(texture + noise, dtype=np.float32), 1.0)) == 0
+
+
+def test_more_noise_than_was_measured_hides_no_period() -> None:
+    """It is measured in a part of the image, and a lattice may be brighter than that."""
+    lattice = waves((12.0, 3.0), (-3.0, 11.0), 2)
+    noise = np.random.default_rng(2).normal(size=lattice.shape)
+    image = np.asarray(lattice + 1.7 * noise, dtype=np.float32)
+    assert find_periods(image, 0.5).shape == (2, 2)
+
+
+def test_a_bright_tool_hides_no_period() -> None:
+    lattice = waves((12.0, 3.0), (-3.0, 11.0), 2)
+    lattice[60:200, :70] = 60.0
+    assert find_periods(np.asarray(lattice, dtype=np.float32), 1.0).shape == (2, 2)
+
+
+@pytest.mark.parametrize("rough", [0.0, 2.0])
+def test_where_a_lattice_is_seen(rough: float) -> None:
+    """Not where a tool is, whatever it shows; defects are of the lattice, also two that lie close together."""
+    lattice = waves((10.0, 2.5), (-2.5, 9.0), 3)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    for column, row in ((170.0, 60.0), (180.0, 72.0), (200.0, 180.0)):
+        lattice -= 12.0 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / 18.0)
+    texture = Texture(3).view((0.0, 0.0), SIZE)
+    lattice[70:190, :90] = 20.0 + (rough * texture)[70:190, :90]
+    image = np.asarray(lattice, dtype=np.float32)
+    seen = find_repeating(image, find_periods(image, 1.0), 1.0, 16)
+    assert not np.any(seen[70:190, :90])
+    assert np.all(seen[:, 120:])
+    assert np.all(seen[:40])

@@ -1,0 +1,374 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which of the shifts that show a periodic specimen alike is its shift: its defects tell.
+
+All shifts that differ by a period show a perfect lattice alike. Defects decide: at a wrong shift, every defect
+disagrees twice, where it is and where it should be. What no defect tells is refused where the lattice is fine, since a
+prediction would only hide a jump by a period. Where a period is a good part of the field, a jump by one is a move of
+the stage and no drift, and a prediction that is good to a tenth of it decides.
+
+What does not repeat in an image by itself, such as a tool over the lattice, has no say: where either image does not
+show the lattice, or next to it, tiles count neither for the refinement nor as defects. A tool moves by itself, and its
+outline would outvote the defects. Each defect that is left unexplained at a shift may be one that another shift would
+explain, which was not among the compared ones: more defects have to speak for a shift than are left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semcal_ros.core.arrays import Array, Mask, mad_sigma
+from semcal_ros.core.errors import Rejection
+from semcal_ros.core.registration.agreement import (
+    Agreement,
+    TileNoise,
+    find_agreement,
+    information_weights,
+)
+from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.inverse_compositional import (
+    Alignment,
+    TileStatistics,
+    align,
+    align_reweighted,
+)
+from semcal_ros.core.registration.periodicity import is_fine
+from semcal_ros.core.registration.thresholds import (
+    DEFECT_EVIDENCE_MAX,
+    DEFECT_SIGMAS,
+    EVIDENCE_MIN,
+    HALF_PERIOD_SIGMAS,
+    PERIODS_COMPARED_MAX,
+    PERIODS_REACH_SIGMAS,
+    SAME_SHIFT_PX,
+)
+from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
+
+
+@dataclass(frozen=True)
+class ChosenShift:
+    """The shift of a periodic specimen, and which tiles agree with it."""
+
+    alignment: Alignment
+    agreement: Agreement
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Where a reference and an image show the lattice, and all around.
+
+    Attributes
+    ----------
+    level
+        The reference.
+    by_reference
+        (rows, cols) the tiles in which the reference does.
+    hidden
+        (h + 1, w + 1) integral of the pixels of the image that do not, or are near such.
+    """
+
+    level: PyramidLevel
+    by_reference: Mask
+    hidden: Array
+
+    @classmethod
+    def of(cls, level: PyramidLevel, reference: Mask, image: Mask) -> _Shown:
+        """From the pixels (h, w) of both that do."""
+        # The edge of something else may run through the tiles around.
+        around = np.ones((2 * level.side[1] + 1, 2 * level.side[0] + 1), np.uint8)
+        hidden = [
+            np.asarray(cv2.integral(cv2.dilate((~mask).astype(np.uint8), around)), np.float64)
+            for mask in (reference, image)
+        ]
+        return cls(level, _is_free(level, hidden[0], np.zeros(2)), hidden[1])
+
+    @property
+    def is_all(self) -> bool:
+        """Whether there is nothing else."""
+        return bool(np.all(self.by_reference)) and not self.hidden[-1, -1]
+
+    def at(self, shift: Array) -> Mask:
+        """(rows, cols) the tiles in which both do at a shift (2,)."""
+        return self.by_reference & _is_free(self.level, self.hidden, shift)
+
+
+def _is_free(level: PyramidLevel, hidden: Array, shift: Array) -> Mask:
+    """(rows, cols) the tiles that have no hidden pixel at a shift."""
+    sides = []
+    for axis in (0, 1):
+        count, most = level.normal_matrices.shape[1 - axis], hidden.shape[1 - axis] - 1
+        first = level.origin[axis] + round(float(shift[axis])) + level.side[axis] * np.arange(count)
+        sides.append((np.clip(first, 0, most), np.clip(first + level.side[axis], 0, most)))
+    (left, right), (top, bottom) = sides
+    corners = [hidden[np.ix_(y, x)] for y in (top, bottom) for x in (left, right)]
+    return np.asarray(corners[3] - corners[2] - corners[1] + corners[0] == 0)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A shift of the class, refined.
+
+    Attributes
+    ----------
+    alignment
+        The shift.
+    energies
+        (rows, cols) mean squared residuals of all tiles of the reference; NaN where none were compared.
+    counted
+        (rows, cols) the tiles that show the lattice there.
+    """
+
+    alignment: Alignment
+    energies: Array
+    counted: Mask
+
+    @property
+    def shift_px(self) -> Array:
+        """(2,) shift."""
+        return self.alignment.shift_px
+
+
+def choose_period(
+    levels: tuple[PyramidLevel, ...],
+    pyramid: Pyramid,
+    periods: Array,
+    start_px: Array,
+    guess: Array,
+    spread: Array | None,
+    noise: TileNoise,
+    repeats: tuple[Mask, Mask],
+) -> ChosenShift | Rejection[MatchFailure]:
+    """The shift of a periodic specimen that its defects tell, or why it is not told.
+
+    Parameters
+    ----------
+    levels, pyramid
+        Reference and image.
+    periods
+        As found by :func:`~semcal_ros.core.registration.periodicity.find_periods`.
+    start_px
+        (2,) any shift that explains the image.
+    guess, spread
+        (2,) predicted shift and its covariance (2, 2), or None.
+    noise
+        That of both.
+    repeats
+        (h, w) where each of them shows the lattice
+        (:func:`~semcal_ros.core.registration.periodicity.find_repeating`).
+    """
+    level = levels[-1]
+    shown = _Shown.of(level, *repeats)
+    compared = _compare_shifts(pyramid, periods, start_px, guess, spread, noise, shown)
+    if isinstance(compared, Rejection):
+        return compared
+    if not compared:
+        return Rejection(MatchFailure.NOT_CONVERGED, "refinement did not converge at any period")
+
+    best = compared[0]
+    for other in compared[1:]:
+        pro, contra = _weigh(best, other)
+        if pro < contra:
+            best = other
+    predicted = _find_predicted(compared, periods, guess, spread, level.size)
+    if predicted is not None and (
+        predicted is best or not _tells(_weigh(best, predicted), EVIDENCE_MIN)
+    ):
+        return _leave_out(pyramid, predicted, noise, shown)
+    least = _find_least_evidence(best, noise)
+    x, y = best.shift_px.tolist()
+    for other in compared:
+        if other is not best and not _tells(_weigh(best, other), least):
+            a, b = other.shift_px.tolist()
+            return Rejection(
+                MatchFailure.AMBIGUOUS,
+                f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, whose defects do not tell "
+                f"shifts ({x:.1f}, {y:.1f}) and ({a:.1f}, {b:.1f}) px apart",
+            )
+    if len(compared) == 1:
+        return Rejection(
+            MatchFailure.AMBIGUOUS,
+            f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, and only one shift to compare",
+        )
+    return _leave_out(pyramid, best, noise, shown)
+
+
+def _compare_shifts(
+    pyramid: Pyramid,
+    periods: Array,
+    start_px: Array,
+    guess: Array,
+    spread: Array | None,
+    noise: TileNoise,
+    shown: _Shown,
+) -> list[_Candidate] | Rejection[MatchFailure]:
+    """The shifts of the class, each refined by what shows the lattice."""
+    level = shown.level
+    first = _refine(pyramid, start_px, noise, shown)
+    if isinstance(first, Rejection):
+        return first
+    shifts = _list_shifts(first.shift_px, periods, guess, spread, level.size)
+    compared: list[_Candidate] = []
+    for shift in shifts:
+        found = _refine(pyramid, shift, noise, shown)
+        if isinstance(found, Rejection) or not found.converged:
+            continue
+        if any(np.max(np.abs(found.shift_px - c.shift_px)) < SAME_SHIFT_PX for c in compared):
+            continue
+        tiles = found.tile_statistics()
+        assert tiles is not None
+        energies = np.full(level.normal_matrices.shape[:2], np.nan)
+        squares = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
+        energies[tiles.rows, tiles.cols] = squares / tiles.pixels
+        compared.append(_Candidate(found, energies, shown.at(found.shift_px)))
+    return compared
+
+
+def _refine(
+    pyramid: Pyramid, shift: Array, noise: TileNoise, shown: _Shown
+) -> Alignment | Rejection[MatchFailure]:
+    """The shift next to one, by what shows the lattice: the rest would pull it."""
+    level = shown.level
+    if shown.is_all:
+        return align([level], pyramid, shift)
+    weights = _weigh_tiles(shown, shift, noise)
+
+    def keep(tiles: TileStatistics) -> Array:
+        return weights[tiles.rows, tiles.cols]
+
+    return align_reweighted(level, pyramid, shift, weights, noise.reference, keep, looks=False)
+
+
+def _weigh_tiles(shown: _Shown, shift: Array, noise: TileNoise) -> Array:
+    """(rows, cols) information of the tiles that show the lattice."""
+    level = shown.level
+    gradient = level.normal_matrices[..., :2, :2]
+    weights = information_weights(gradient, level.pixel_counts, level.sigma_px, noise)
+    return np.where(shown.at(shift), weights, 0.0)
+
+
+def _leave_out(
+    pyramid: Pyramid, found: _Candidate, noise: TileNoise, shown: _Shown
+) -> ChosenShift | Rejection[MatchFailure]:
+    """The shift by all that agrees with it."""
+    tiles = found.alignment.tile_statistics()
+    assert tiles is not None
+    agreement = find_agreement(tiles, noise)
+    if shown.is_all and agreement.is_complete:
+        return ChosenShift(found.alignment, agreement)
+    latest = [agreement]
+
+    def judge(tiles: TileStatistics) -> Array:
+        latest[:] = [find_agreement(tiles, noise)]
+        return latest[0].weights
+
+    shift = found.shift_px
+    weights = _weigh_tiles(shown, shift, noise)
+    alignment = align_reweighted(
+        shown.level, pyramid, shift, weights, noise.reference, judge, looks=False
+    )
+    if isinstance(alignment, Rejection):
+        return alignment
+    if np.max(np.abs(alignment.shift_px - shift)) > SAME_SHIFT_PX:
+        return Rejection(
+            MatchFailure.AMBIGUOUS,
+            "ambiguous: what repeats moves otherwise than all that agrees with its shift",
+        )
+    return ChosenShift(alignment, latest[0])
+
+
+def _find_least_evidence(best: _Candidate, noise: TileNoise) -> float:
+    """Evidence that has to speak for a shift: two defects, and more than are left unexplained there."""
+    tiles = best.alignment.tile_statistics()
+    assert tiles is not None
+    disagrees = np.zeros_like(best.counted)
+    disagrees[tiles.rows, tiles.cols] = find_agreement(tiles, noise).disagrees
+    labels, bodies = cv2.connectedComponents(disagrees.astype(np.uint8), connectivity=8)
+    # What has a part that is not of the lattice is no defect of it.
+    defects = np.setdiff1d(np.arange(1, labels), bodies[~best.counted])
+    return max(EVIDENCE_MIN, DEFECT_EVIDENCE_MAX * (len(defects) + 1))
+
+
+def _find_predicted(
+    compared: list[_Candidate],
+    periods: Array,
+    guess: Array,
+    spread: Array | None,
+    size: tuple[int, int],
+) -> _Candidate | None:
+    """The shift that a prediction tells; None where the lattice is fine, or the prediction not good enough."""
+    if spread is None or is_fine(periods, size):
+        return None
+    shortest = float(np.min(np.hypot(*periods.T)))
+    sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
+    if HALF_PERIOD_SIGMAS * sigma > 0.5 * shortest:
+        return None
+    distances = [float(np.hypot(*(c.shift_px - guess))) for c in compared]
+    nearest = int(np.argmin(distances))
+    return compared[nearest] if distances[nearest] < 0.25 * shortest else None
+
+
+def _list_shifts(
+    shift: Array, periods: Array, guess: Array, spread: Array | None, size: tuple[int, int]
+) -> Array:
+    """Shifts of the class that the prediction allows, and those next to it; the nearest to it first."""
+    counts = np.arange(-60, 61)
+    if len(periods) == 1:
+        steps = counts[:, None] * periods[0]
+    else:
+        steps = (counts[:, None, None] * periods[0] + counts[None, :, None] * periods[1]).reshape(
+            -1, 2
+        )
+    found = shift + steps
+    found = found[np.all(np.abs(found) < 0.5 * np.array(size), axis=1)]
+    covariance = np.eye(2) * (0.25 * max(size)) ** 2 if spread is None else spread
+    covariance = covariance + np.eye(2) * (0.5 * np.hypot(*periods[0])) ** 2
+    left = found - guess
+    distances = np.einsum("ni,ij,nj->n", left, np.linalg.inv(covariance), left)
+    order = np.argsort(distances, kind="stable")
+    # The nearest ones always compete: a jump by a period is what must not happen.
+    allowed = (distances[order] <= PERIODS_REACH_SIGMAS**2) | (np.arange(len(order)) < 9)
+    return found[order[allowed]][:PERIODS_COMPARED_MAX]
+
+
+def _tells(evidence: tuple[float, float], least: float) -> bool:
+    """Whether the defects are where the first of two shifts says, and none where the second does."""
+    pro, contra = evidence
+    return pro >= least and contra < DEFECT_EVIDENCE_MAX
+
+
+def _weigh(first: _Candidate, second: _Candidate) -> tuple[float, float]:
+    """Evidence for the first of two shifts and for the second, by the residual energies of their tiles.
+
+    What lies together counts as one defect, however large and clear it is.
+    """
+    difference = second.energies - first.energies
+    finite = np.isfinite(difference) & first.counted & second.counted
+    if not np.any(finite):
+        return 0.0, 0.0
+    middle = float(np.median(difference[finite]))
+    deviations = (difference - middle) / max(mad_sigma(difference[finite] - middle), 1e-30)
+    deviations = np.where(finite, deviations, 0.0)
+    return _count_defects(deviations), _count_defects(-deviations)
+
+
+def _count_defects(deviations: Array) -> float:
+    """Sum of the squares of clear deviations above zero, of each body of tiles that of one defect at most."""
+    clear = deviations > DEFECT_SIGMAS
+    labels, bodies = cv2.connectedComponents(clear.astype(np.uint8), connectivity=8)
+    sums = np.bincount(bodies.ravel(), weights=(deviations**2).ravel(), minlength=labels)
+    return float(np.minimum(sums[1:], DEFECT_EVIDENCE_MAX).sum())

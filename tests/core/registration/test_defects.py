@@ -1,0 +1,150 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The defects of a lattice tell its shift, also beside a tool, which has no say in it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.registration.defects import _Candidate, _find_least_evidence
+from semcal_ros.core.registration.inverse_compositional import Alignment, align
+from semcal_ros.core.registration.register import Registration, prepare_reference, register_pair
+from semcal_ros.core.registration.specimen import noise_beside_tools
+from semcal_ros.core.registration.thresholds import DEFECT_EVIDENCE_MAX, EVIDENCE_MIN
+from semcal_ros.core.registration.tiles import Pyramid
+from tests.helpers.drift_scenes import lattice, noisy
+
+SIZE = 192
+#: A tip from the left, that moves by itself: where its apex is, px.
+TIP_AT = np.array([80.0, 90.0])
+
+
+def draw_lattice(
+    period: float, angle: float, shift: Array, defects: Array, *, contrast: float = 1.0
+) -> Array:
+    """A lattice of squares of ``period`` px, and particles (n, 2) on it."""
+    whole = contrast * lattice(SIZE, period, (float(shift[0]), float(shift[1])), angle)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    for defect in defects + shift:
+        whole = whole + 2.0 * np.exp(-((x - defect[0]) ** 2 + (y - defect[1]) ** 2) / 18.0)
+    return np.asarray(whole)
+
+
+def cover(picture: Array, apex: Array, level: float = 4.0, grain: Array | None = None) -> Array:
+    """A picture with a tip over it."""
+    corners = np.array([[-400.0, -70.0], [-30.0, -55.0], [0.0, 0.0], [-30.0, 55.0], [-400.0, 70.0]])
+    part = np.zeros((SIZE, SIZE), np.uint8)
+    cv2.fillPoly(
+        part, [np.rint(16.0 * (corners + apex)).astype(np.int32)], 255, cv2.LINE_AA, shift=4
+    )
+    share = cv2.GaussianBlur(part.astype(np.float64) / 255.0, (0, 0), 0.8)
+    return np.asarray((1.0 - share) * picture + share * (level if grain is None else level + grain))
+
+
+def compare(first: Array, second: Array, guess: Array, sigma_px: float) -> Registration:
+    """The second picture against the first one, both with noise."""
+    pair = noisy(first, 4.0, 1), noisy(second, 4.0, 2)
+    return register_pair(*pair, guess_px=guess, guess_covariance=np.eye(2) * sigma_px**2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_defects_tell_the_shift_beside_a_tool_that_came_in(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    period, angle = rng.uniform(4.0, 5.5), rng.uniform(0.0, 0.7)
+    shift = rng.uniform(-4.0, 4.0, 2)
+    defects = np.column_stack([rng.uniform(120.0, 175.0, 6), np.linspace(20.0, 170.0, 6)])
+    first = draw_lattice(period, angle, np.zeros(2), defects)
+    second = cover(draw_lattice(period, angle, shift, defects), TIP_AT)
+    found = compare(first, second, shift + 0.2, 0.5)
+    assert found.accepted, found.reason
+    np.testing.assert_allclose(found.shift_px, shift, atol=0.06)
+    assert found.moving is not None
+    columns = np.flatnonzero(found.moving.draw((SIZE, SIZE)).any(axis=0))
+    assert columns.max() < TIP_AT[0] + 25.0
+    # A jump by a period is seen, whatever was predicted: the tool does not hide it.
+    side = 2.0 * period * np.array([np.cos(angle), np.sin(angle)])
+    jumped = cover(draw_lattice(period, angle, shift + side, defects), TIP_AT)
+    after = compare(first, jumped, shift, 0.5)
+    assert not after.accepted or np.max(np.abs(after.shift_px - shift - side)) < 0.06
+
+
+@pytest.mark.parametrize("rough", [False, True])
+@pytest.mark.parametrize("of_lattice", [False, True])
+def test_a_tool_over_a_perfect_lattice_tells_no_period(of_lattice: bool, rough: bool) -> None:
+    """It may have moved against the lattice by a period, as one that rests does where the lattice drifts by one."""
+    angle, period = 0.3, 5.0
+    side = 2.0 * period * np.array([np.cos(angle), np.sin(angle)])
+    none = np.zeros((0, 2))
+    grain = np.random.default_rng(3).normal(size=(SIZE, SIZE))
+    grain = 4.0 * cv2.GaussianBlur(grain, (0, 0), 2.0)
+    pair = []
+    for k in (0, 1):
+        moved = k * side
+        picture = draw_lattice(period, angle, moved if of_lattice else np.zeros(2), none)
+        apex = TIP_AT if of_lattice else TIP_AT + moved
+        grown = cv2.warpAffine(
+            grain,
+            np.array([[1.0, 0.0, apex[0]], [0.0, 1.0, apex[1]]]),
+            (SIZE, SIZE),
+            flags=cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_WRAP,
+        )
+        pair.append(cover(picture, apex, grain=grown if rough else None))
+    for sigma_px in (0.3, 8.0):
+        assert "ambiguous" in compare(*pair, np.zeros(2), sigma_px).reason
+
+
+def test_a_tool_that_outshines_a_lattice_does_not_choose_its_period() -> None:
+    """The highest peak of the correlation is that of the tool, which has moved by a period against the specimen."""
+    angle, period, shift = 0.3, 5.0, np.array([0.6, -0.4])
+    side = 2.0 * period * np.array([np.cos(angle), np.sin(angle)])
+    defects = np.array([[150.0, 30.0], [130.0, 165.0], [170.0, 100.0], [165.0, 150.0]])
+    first, second = (
+        draw_lattice(period, angle, at, defects, contrast=0.5) for at in (np.zeros(2), shift)
+    )
+    pair = cover(first, TIP_AT), cover(second, TIP_AT + shift + side)
+    for guess, sigma_px in ((shift, 0.5), (shift + side, 0.5), (shift, 10.0)):
+        found = compare(*pair, guess, sigma_px)
+        assert not found.accepted or np.max(np.abs(found.shift_px - shift)) < 0.1
+
+
+def test_defects_that_are_left_unexplained_ask_for_more_evidence() -> None:
+    """At a shift far from the prediction: that by a period explains half of the defects, by others of the reference."""
+    period, shift, guess = 5.0, np.array([80.0, 0.0]), np.array([10.0, 0.0])
+    heights = np.array([25.0, 60.0, 100.0, 145.0])
+    farther = np.column_stack([np.full(4, 150.0), heights])
+    defects = np.concatenate([farther, farther + guess - shift])
+    pair = [draw_lattice(period, 0.0, at, defects) for at in (np.zeros(2), shift)]
+    assert "ambiguous" in compare(*pair, guess, 0.5).reason
+    near = compare(*pair, shift, 0.5)
+    assert near.accepted, near.reason
+    np.testing.assert_allclose(near.shift_px, shift, atol=0.06)
+    reference = prepare_reference(noisy(pair[0], 4.0, 1))
+    pyramid = Pyramid(np.asarray(noisy(pair[1], 4.0, 2), dtype=np.float32))
+    noise = noise_beside_tools(reference, pyramid)
+    level = reference.levels[-1]
+    everywhere = np.ones(level.normal_matrices.shape[:2], dtype=bool)
+    least = []
+    for start in (shift, guess):
+        found = align([level], pyramid, start)
+        assert isinstance(found, Alignment)
+        candidate = _Candidate(found, np.zeros(everywhere.shape), everywhere)
+        least.append(_find_least_evidence(candidate, noise))
+    # Two defects, and one more than the four that the second shift does not explain.
+    assert least[0] == EVIDENCE_MIN
+    assert least[1] == 5.0 * DEFECT_EVIDENCE_MAX
