@@ -115,7 +115,8 @@ def run(case: Any) -> Answer:
     """Register the images of a case, each with what moved in the one before."""
     start = time.process_time()
     if isinstance(case[0], str):
-        return _affine(*case[1], case[2], start)
+        template, image = case[1]
+        return _affine(template, image, case[2], start)
     picture, images, sigma_px, fixed = case
     reference = prepare_reference(picture, fixed=fixed)
     moving, found, errors, scores = None, [], [], []
