@@ -231,12 +231,16 @@ def study(
         found = _call(limit_s, _run, table, room.fleet, Change(name, by), own, until)
         return Difference(False, raised=found) if isinstance(found, str) else compare(usual, found)
 
+    def cases_of(name: str) -> dict[str, bytes]:
+        by = users[name]
+        return {case: cases[case] for case in cases if by is None or read[case] & by}
+
+    chosen = [row for row in rows if (row.name in names if names else row.kind in kinds)]
+    # The quickest first.
+    chosen.sort(key=lambda row: sum(usual[case].seconds for case in cases_of(row.name)))
     done = []
-    for row in rows:
-        if row.name not in names if names else row.kind not in kinds:
-            continue
-        by = users[row.name]
-        own = {name: case for name, case in cases.items() if by is None or read[name] & by}
+    for row in chosen:
+        own = cases_of(row.name)
         larger = smaller = reached = None
         if own:
             larger, smaller = (change(own, row.name, f) for f in (factor, 1.0 / factor))

@@ -15,7 +15,8 @@
 """Pictures of grids of every kind, and of none, for the search for corners.
 
 The narrowest of the random pictures of ``benchmarks.calibration.looks``, a replica and gratings; what must be refused
-are grounds of ``benchmarks.drift.scenes``. Errors are in px, of one coordinate.
+are grounds of ``benchmarks.drift.scenes``. Errors are in px, of one coordinate; of gratings, only how smoothly their
+lines run is judged.
 """
 
 from __future__ import annotations
