@@ -40,8 +40,9 @@ Not among these: ``python -m benchmarks.drift.soak``, 20 000 frames out and back
 ``python -m benchmarks.calibration.observable``, what of that shifts, turns and zooms tell,
 ``python -m benchmarks.calibration.fleet``, random microscopes that a calibration has to hold on,
 ``python -m benchmarks.calibration.starts``, random first states that have to end at the same place,
-``python -m benchmarks.calibration.solvers``, the solver of the calibration beside others, and
-``python -m benchmarks.calibration.looks``, random pictures of grids that have to be found.
+``python -m benchmarks.calibration.solvers``, the solver of the calibration beside others,
+``python -m benchmarks.calibration.looks``, random pictures of grids that have to be found, and
+``python -m benchmarks.thresholds``, what the numbers in the tables of thresholds do.
 
 Everything but one column is measured on simulated data whose truth is known, with fixed seeds.
 Accuracy is in px and stands beside a bound wherever there is one. A time is the ratio of two

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -41,6 +42,8 @@ NO_THRESHOLDS = {
     # Sizes of the parts of the state.
     *("MOTION_SIZE", "BASE_SIZE", "KEYFRAME_SIZE"),
 }
+# Changes the rows of a room in turn.
+THRESHOLDS = "benchmarks.thresholds"
 house = load_script("house")
 
 
@@ -132,6 +135,22 @@ def test_every_number_is_used_and_has_a_unit_and_a_source(room: Path) -> None:
 def _uses(module: ModuleType, name: str) -> int:
     tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
     return sum(isinstance(node, ast.Name) and node.id == name for node in ast.walk(tree))
+
+
+def test_a_measured_number_names_a_command_that_exists_and_a_year(room: Path) -> None:
+    module, table = _table(room)
+    for row in table:
+        if row.source is not Source.MEASURED:
+            continue
+        found = re.search(r"\(python -m ([\w.]+)(?: (\w+))?[^()]*\)$", row.text)
+        assert found, row
+        command, of_room = found.groups()
+        path = ROOT / command.replace(".", "/")
+        assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), row
+        assert re.search(r"\b20\d\d\b", row.text), row
+        if command == THRESHOLDS:
+            own = importlib.import_module(f"{THRESHOLDS}.__main__").ROOMS[of_room]
+            assert module.__name__ == f"semcal_ros.{own.table}.thresholds", row
 
 
 def test_a_name_stands_once_and_a_command_with_what_it_shows() -> None:

@@ -26,6 +26,9 @@ from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
 
+# Of the measured rows: each says in how many pictures it was tried, and what changed in them (doc/thresholds.md).
+TRIED = "python -m benchmarks.thresholds corners, 26 November 2026"
+
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
@@ -35,10 +38,12 @@ SADDLE_THRESHOLD = TABLE.derived(
     "SADDLE_THRESHOLD", 0.1, "of the strong response",
     "A weaker maximum counts as noise. The response is quadratic in the contrast, so a third of it leaves 1/9.",
 )
-STRONG_RANK = TABLE.stated(
+STRONG_RANK = TABLE.measured(
     "STRONG_RANK", 12, "rank",
     "The response at this rank stands for the strong saddles: a usable image has as many corners, and a few "
-    "specks brighter than the board do not set the threshold.",
+    "specks brighter than the board do not set the threshold. With 8 or 18, 9 pictures are decided alike, and "
+    "errors change by 0.92 % at most.",
+    command=TRIED,
 )
 SADDLES_MIN = TABLE.cost(
     "SADDLES_MIN", 6000, "points",
@@ -149,30 +154,38 @@ ANGLE_PRIOR = TABLE.derived(
     "ANGLE_PRIOR", 0.03, "rad",
     "Edge about that of the local map: saddle points good to 0.3 px, over a square of 10 px.",
 )
-LOG_BLUR_PRIOR = TABLE.stated(
+LOG_BLUR_PRIOR = TABLE.measured(
     "LOG_BLUR_PRIOR", 0.5, "log",
-    "A factor of 1.65 about the first guess.",
+    "A factor of 1.65 about the first guess. 1.5 times as large or as small, 3 pictures are decided alike, and "
+    "errors change by 0.9 % at most.",
+    command=TRIED,
 )
-SAGITTA_PRIOR_PX = TABLE.stated(
+SAGITTA_PRIOR_PX = TABLE.measured(
     "SAGITTA_PRIOR_PX", 0.5, "px",
     "Error of a map through few, one-sided neighbours under a strong distortion, for squares of LARGE_SQUARE_PX; "
-    "it grows as the third power of the square.",
+    "it grows as the third power of the square. 1.5 times as large, errors change by 0.8 %; as small, errors over "
+    "sigma are 5.1 % smaller (3 pictures).",
+    command=TRIED,
 )
 LARGE_SQUARE_PX = TABLE.derived(
     "LARGE_SQUARE_PX", 130.0, "px",
     "About a quarter of a 512 px image.",
 )
-GRADIENT_PRIOR = TABLE.stated(
+GRADIENT_PRIOR = TABLE.measured(
     "GRADIENT_PRIOR", 0.15, "contrast of the image",
-    "Shading over half a square.",
+    "Shading over half a square. 1.5 times as large or as small, 3 pictures are decided alike, and errors change "
+    "by 4.3 % at most.",
+    command=TRIED,
 )
 GRADIENT_LEAST = TABLE.derived(
     "GRADIENT_LEAST", 0.003, "grey range",
     "Least deviation of a gradient that the neighbours predict: just below the step of an 8-bit image, 1 / 255.",
 )
-GROWTH_PRIOR_PX = TABLE.stated(
+GROWTH_PRIOR_PX = TABLE.measured(
     "GROWTH_PRIOR_PX", 0.3, "px x contrast",
-    "Growth of the bright squares.",
+    "Growth of the bright squares. 1.5 times as large or as small, 3 pictures are decided alike, and errors "
+    "change by 1 % at most.",
+    command=TRIED,
 )
 LIKELIHOOD_LOSS = TABLE.derived(
     "LIKELIHOOD_LOSS", 0.5, "log-likelihood",
@@ -183,9 +196,11 @@ OUTLIER_SCORE = TABLE.derived(
     "Where an outlier's weight ends: three standard deviations, squared.",
 )
 
-PRIOR_SPREADS = TABLE.stated(
+PRIOR_SPREADS = TABLE.measured(
     "PRIOR_SPREADS", np.concatenate([np.geomspace(0.02, 1.0, 14), np.geomspace(1.35, 11.0, 8)]), "of the priors",
-    "That are tried; those above 1 only where the corners show more than the priors allow.",
+    "That are tried; those above 1 only where the corners show more than the priors allow. 1.5 times as large or "
+    "as small, 3 pictures are decided alike, and errors change by 2.6 % at most.",
+    command=TRIED,
 )
 
 # The fit of corners, in corner_fit.py
@@ -194,9 +209,11 @@ BLUR_MIN_PX = TABLE.derived(
     "BLUR_MIN_PX", 0.28, "px",
     "A pixel averages over its width, a blur of 1 / sqrt(12) = 0.289 px: no edge is sharper.",
 )
-BAND_MIN_PX = TABLE.stated(
+BAND_MIN_PX = TABLE.measured(
     "BAND_MIN_PX", 3.0, "px",
-    "Least half-width of the band along an edge, which leaves room for an error of the prediction.",
+    "Least half-width of the band along an edge, which leaves room for an error of the prediction. 1.5 times as "
+    "large or as small, 3 pictures are decided alike, and errors change by 2.5 % at most.",
+    command=TRIED,
 )
 BAND_BLURS = TABLE.derived(
     "BAND_BLURS", 3.0, "blur widths",
@@ -211,24 +228,32 @@ FIT_BLOCK_PIXELS = TABLE.cost(
     "FIT_BLOCK_PIXELS", 24000, "px",
     "Large enough to hide the cost of a call, small enough to keep the arrays in the cache.",
 )
-PULL_LEAST = TABLE.stated(
+PULL_LEAST = TABLE.measured(
     "PULL_LEAST", 0.02, "of the prior's variance",
-    "Where pixels carry almost no information, rounding must not decide whether a pull is large.",
+    "Where pixels carry almost no information, rounding must not decide whether a pull is large. 1.5 times as "
+    "large or as small, it changes nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-ASSUMED_VARIANCE = TABLE.stated(
+ASSUMED_VARIANCE = TABLE.measured(
     "ASSUMED_VARIANCE", 0.02, "contrast^2",
-    "Of a pixel in the first pass, before the noise is known.",
+    "Of a pixel in the first pass, before the noise is known. 1.5 times as large or as small, 3 pictures are "
+    "decided alike, and errors change by 0.98 % at most.",
+    command=TRIED,
 )
 
 # Refining a lattice, in lattice_refinement.py
 
-FIRST_BLUR_PX = TABLE.stated(
+FIRST_BLUR_PX = TABLE.measured(
     "FIRST_BLUR_PX", 1.0, "px",
-    "Where the first fits start; LOG_BLUR_PRIOR covers 0.37 to 2.7 px within two sigma.",
+    "Where the first fits start; LOG_BLUR_PRIOR covers 0.37 to 2.7 px within two sigma. 1.5 times as large or as "
+    "small, 3 pictures are decided alike, and errors change by 2.4 % at most.",
+    command=TRIED,
 )
-GROW_ROUNDS = TABLE.stated(
+GROW_ROUNDS = TABLE.measured(
     "GROW_ROUNDS", 4, "rounds",
-    "Of filling in; each adds a ring of cells, and growing has found most of them before.",
+    "Of filling in; each adds a ring of cells, and growing has found most of them before. With 3 or 6, it changes "
+    "nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 CORNER_SAMPLE = TABLE.cost(
     "CORNER_SAMPLE", 40, "corners",
@@ -243,9 +268,11 @@ CORNER_SECOND_SAMPLE = TABLE.cost(
     "CORNER_SECOND_SAMPLE", 160, "corners",
     "From which the spreads are learnt again, when noise and blur are known.",
 )
-RIM_PART = TABLE.stated(
+RIM_PART = TABLE.measured(
     "RIM_PART", 0.1, "squares",
-    "Corners nearer to the frame than MARGIN_PX and this may fail.",
+    "Corners nearer to the frame than MARGIN_PX and this may fail. 1.5 times as large or as small, it changes "
+    "nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Checks of fitted corners, in checks.py
@@ -263,9 +290,11 @@ PART_MIN = TABLE.stated(
     "PART_MIN", 4, "corners",
     "Smaller parts were predicted from the corners across the gap already, and agree with them.",
 )
-MARGIN_PX = TABLE.stated(
+MARGIN_PX = TABLE.measured(
     "MARGIN_PX", 2.0, "px",
-    "Corners nearer to the frame are not fitted: up to half of their window is outside the image.",
+    "Corners nearer to the frame are not fitted: up to half of their window is outside the image. 1.5 times as "
+    "large, errors over sigma are 7.1 % smaller; as small, errors over sigma are 5.7 % smaller (3 pictures).",
+    command=TRIED,
 )
 CONTRAST_MIN = TABLE.derived(
     "CONTRAST_MIN", 0.3, "of the median",
@@ -280,9 +309,11 @@ ANGLE_MAX = TABLE.derived(
     "ANGLE_MAX", 0.2, "rad",
     "Between a fitted edge and the local map: 6.7 standard deviations of ANGLE_PRIOR.",
 )
-CHI2_MAX = TABLE.stated(
+CHI2_MAX = TABLE.measured(
     "CHI2_MAX", 4.0, "median chi-square",
-    "Residuals of more than twice the usual size do not belong to a corner.",
+    "Residuals of more than twice the usual size do not belong to a corner. 1.5 times as large or as small, it "
+    "changes nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 CHI2_EXCESS = TABLE.stated(
     "CHI2_EXCESS", 0.5, "of the median",
@@ -301,9 +332,11 @@ IMBALANCE_MAX = TABLE.derived(
     "IMBALANCE_MAX", 15.0, "chi-square, 2 degrees",
     "By chance once in 1800 undisturbed corners: exp(-15 / 2).",
 )
-UNLIKE_MAX = TABLE.stated(
+UNLIKE_MAX = TABLE.measured(
     "UNLIKE_MAX", 0.05, "half the contrast",
-    "Stains of the board and shortcomings of the model.",
+    "Stains of the board and shortcomings of the model. 1.5 times as large or as small, it changes nothing in 3 "
+    "pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 BORDER_UNLIKE = TABLE.derived(
     "BORDER_UNLIKE", 0.5, "CornerFit.unlike",
@@ -357,9 +390,11 @@ MEDIAN_SIGMA_2 = TABLE.derived(
 
 # What the motif of a cell is, in pattern.py
 
-HARMONIC_ORDERS = TABLE.stated(
+HARMONIC_ORDERS = TABLE.measured(
     "HARMONIC_ORDERS", 4, "order",
-    "With more harmonics, small spacings would be judged by noise.",
+    "With more harmonics, small spacings would be judged by noise. With 3 or 6, it changes nothing in 9 pictures; "
+    "a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 AMBIGUOUS_RATIO = TABLE.derived(
     "AMBIGUOUS_RATIO", 2.0, "ratio of misfits",
@@ -369,21 +404,27 @@ COMPARABLE_RATIO = TABLE.derived(
     "COMPARABLE_RATIO", 1.24, "ratio of misfits",
     "Up to it a checkerboard is presumed: odds of 20 to one with 28 harmonics, 20^(2 / 28).",
 )
-SHAPE_MISFIT_LEAST = TABLE.stated(
+SHAPE_MISFIT_LEAST = TABLE.measured(
     "SHAPE_MISFIT_LEAST", 2e-4, "of the power",
-    "Misfit that the steps of sizes and blurs cause.",
+    "Misfit that the steps of sizes and blurs cause. 1.5 times as large or as small, it changes nothing in 9 "
+    "pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 LINES_OPENING_MIN = TABLE.derived(
     "LINES_OPENING_MIN", 0.55, "cells",
     "Bars 0.45 of their distance wide leave as much open; square dots that wide could as well be that.",
 )
-MOTIF_STEP = TABLE.stated(
+MOTIF_STEP = TABLE.measured(
     "MOTIF_STEP", 1.0 / 12.0, "cells",
-    "The middle of a motif is looked for in such steps, within the reach of the centre of symmetry.",
+    "The middle of a motif is looked for in such steps, within the reach of the centre of symmetry. 1.5 times as "
+    "large or as small, it changes nothing in 1 picture; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-SHAPES_FOR_CENTRE = TABLE.stated(
+SHAPES_FOR_CENTRE = TABLE.measured(
     "SHAPES_FOR_CENTRE", 7, "shapes",
-    "One of so many is enough to find the centre under a relief.",
+    "One of so many is enough to find the centre under a relief. With 5 or 10, it changes nothing in 9 pictures; "
+    "a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 RELIEF_GAIN_MIN = TABLE.derived(
     "RELIEF_GAIN_MIN", 1.6, "ratio of powers",
@@ -405,21 +446,29 @@ ODDS_MAX = TABLE.defined(
     "Odds beyond a million say nothing more.",
 )
 
-MOTIF_SIZES = TABLE.stated(
+MOTIF_SIZES = TABLE.measured(
     "MOTIF_SIZES", np.linspace(0.08, 0.98, 46), "cells",
-    "Diameters of discs and sides of squares that are tried.",
+    "Diameters of discs and sides of squares that are tried. 1.5 times as large, nothing changes; as small, 1 of "
+    "9 pictures is decided otherwise and 1 wrong answer more.",
+    command=TRIED,
 )
-CHESS_SIZES = TABLE.stated(
+CHESS_SIZES = TABLE.measured(
     "CHESS_SIZES", np.linspace(0.82, 1.0, 10), "cells",
-    "The same of the squares of a checkerboard.",
+    "The same of the squares of a checkerboard. 1.5 times as large, 3 of 9 pictures are decided otherwise and 3 "
+    "wrong answers more; as small, 3 of 9 pictures are decided otherwise and 3 wrong answers more.",
+    command=TRIED,
 )
-MOTIF_BLURS = TABLE.stated(
+MOTIF_BLURS = TABLE.measured(
     "MOTIF_BLURS", np.linspace(0.0, 0.24, 13), "cells",
-    "Blurs that are tried.",
+    "Blurs that are tried. 1.5 times as large or as small, it changes nothing in 9 pictures; a thousand times or "
+    "a thousandth of it does.",
+    command=TRIED,
 )
-ARM_LENGTHS = TABLE.stated(
+ARM_LENGTHS = TABLE.measured(
     "ARM_LENGTHS", np.linspace(0.2, 0.44, 7), "cells",
-    "Half lengths of the arms of crosses, from their centre; longer ones meet, and are lines.",
+    "Half lengths of the arms of crosses, from their centre; longer ones meet, and are lines. 1.5 times as large, "
+    "nothing changes; as small, 1 of 9 pictures is decided otherwise and 1 wrong answer more.",
+    command=TRIED,
 )
 ARM_WIDTHS = TABLE.stated(
     "ARM_WIDTHS", np.linspace(0.06, 0.42, 13), "cells",
@@ -566,13 +615,17 @@ PHASE_PLACES_MAX = TABLE.cost(
     "PHASE_PLACES_MAX", 128, "places",
     "Across a picture, at which the phase is compared with the next.",
 )
-LINES_AMPLITUDE_MIN = TABLE.stated(
+LINES_AMPLITUDE_MIN = TABLE.measured(
     "LINES_AMPLITUDE_MIN", 0.3, "of the median",
-    "Below it there are no lines, such as under debris or beyond the end of the grating.",
+    "Below it there are no lines, such as under debris or beyond the end of the grating. 1.5 times as large or as "
+    "small, 3 pictures are decided alike, and errors change by 1.1 % at most.",
+    command=TRIED,
 )
-LOST_PHASE_RAD = TABLE.stated(
+LOST_PHASE_RAD = TABLE.measured(
     "LOST_PHASE_RAD", 2.0, "rad",
-    "Residual phase beyond which lines were not followed; half a period is pi.",
+    "Residual phase beyond which lines were not followed; half a period is pi. 1.5 times as large or as small, it "
+    "changes nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Spectra, in spectrum.py
@@ -581,13 +634,17 @@ SPECTRUM_PX = TABLE.cost(
     "SPECTRUM_PX", 1024, "px",
     "Side of the part, at each scale, in which the frequency is looked for.",
 )
-PERIODS_MIN = TABLE.stated(
+PERIODS_MIN = TABLE.measured(
     "PERIODS_MIN", 3.5, "periods",
-    "In the part, that are looked for.",
+    "In the part, that are looked for. 1.5 times as large or as small, it changes nothing in 4 pictures; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-PERIOD_MIN_PX = TABLE.stated(
+PERIOD_MIN_PX = TABLE.measured(
     "PERIOD_MIN_PX", 5.0, "px",
-    "The shortest period that is looked for.",
+    "The shortest period that is looked for. 1.5 times as large or as small, 4 pictures are decided alike, and "
+    "errors change by 0.52 % at most.",
+    command=TRIED,
 )
 SUBMULTIPLE_POWER = TABLE.derived(
     "SUBMULTIPLE_POWER", 50.0, "usual power",
@@ -602,13 +659,17 @@ WINDOW_LOBE_BINS = TABLE.derived(
     "WINDOW_LOBE_BINS", 3.0, "bins",
     "Beside the direction of the lines that belong to them: half of the main lobe of the Hann window is two.",
 )
-BENT_LINES_PART = TABLE.stated(
+BENT_LINES_PART = TABLE.measured(
     "BENT_LINES_PART", 0.1, "of the frequency",
-    "A distortion may bend lines by so much; it has as many bins.",
+    "A distortion may bend lines by so much; it has as many bins. 1.5 times as large or as small, it changes "
+    "nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-MULTIPLES_COMPARED = TABLE.stated(
+MULTIPLES_COMPARED = TABLE.measured(
     "MULTIPLES_COMPARED", 2.2, "multiples",
-    "Frequencies of the lines are compared up to it.",
+    "Frequencies of the lines are compared up to it. 1.5 times as large or as small, it changes nothing in 3 "
+    "pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 FREQUENCY_OFF_BINS = TABLE.stated(
     "FREQUENCY_OFF_BINS", 1.0, "bins",
@@ -626,40 +687,54 @@ FAINT_PEAK = TABLE.stated(
     "FAINT_PEAK", 5e-3, "of the clearest",
     "From which a maximum counts: those of a hole's edge are mostly below.",
 )
-MULTIPLE_POWER_RATIO = TABLE.stated(
+MULTIPLE_POWER_RATIO = TABLE.measured(
     "MULTIPLE_POWER_RATIO", 10.0, "ratio of powers",
-    "From which the lines are followed by a multiple.",
+    "From which the lines are followed by a multiple. 1.5 times as large or as small, 3 pictures are decided "
+    "alike, and errors change by 0.52 % at most.",
+    command=TRIED,
 )
-HIGHEST_HARMONIC = TABLE.stated(
+HIGHEST_HARMONIC = TABLE.measured(
     "HIGHEST_HARMONIC", 9, "order",
     "Of narrow lines many harmonics are as strong as the fundamental, and a hole has the less power the higher "
-    "they are.",
+    "they are. With 6 or 14, it changes nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 EVERYWHERE_RATIO = TABLE.derived(
     "EVERYWHERE_RATIO", 2.5, "medians of others",
     "From which a frequency is everywhere: of noise alone, medians over twenty independent places scatter by 15 "
     "%, so that it is ten of their deviations above.",
 )
-PLACES_ACROSS = TABLE.stated(
+PLACES_ACROSS = TABLE.measured(
     "PLACES_ACROSS", 16, "places",
-    "The low pass as a part of the picture: a hole of a third of the side then reaches a quarter of the places.",
+    "The low pass as a part of the picture: a hole of a third of the side then reaches a quarter of the places. "
+    "With 11 or 24, it changes nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-OTHER_DIRECTIONS_DEG = TABLE.stated(
+OTHER_DIRECTIONS_DEG = TABLE.measured(
     "OTHER_DIRECTIONS_DEG", (25.0, 50.0, 75.0, 105.0, 130.0, 155.0), "deg",
-    "With which a frequency is compared; of a square lattice, 90 degrees would be another of its frequencies.",
+    "With which a frequency is compared; of a square lattice, 90 degrees would be another of its frequencies. 1.5 "
+    "times as large or as small, it changes nothing in 3 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-CLIPPED_PART = TABLE.stated(
+CLIPPED_PART = TABLE.measured(
     "CLIPPED_PART", 0.2, "of the pixels",
     "Whose grey levels are clipped at either end: holes and debris in a fifth of the picture have no more "
-    "contrast than lines that take more than that of their period.",
+    "contrast than lines that take more than that of their period. 1.5 times as large or as small, 4 pictures are "
+    "decided alike, and errors change by 0.36 % at most.",
+    command=TRIED,
 )
-USUAL_QUANTILE = TABLE.stated(
+USUAL_QUANTILE = TABLE.measured(
     "USUAL_QUANTILE", 0.25, "quantile",
-    "Of the power in a ring, that stands for what is usual there; of noise it is -log(0.75) = 0.288 of the mean.",
+    "Of the power in a ring, that stands for what is usual there; of noise it is -log(0.75) = 0.288 of the mean. "
+    "1.5 times as large or as small, it changes nothing in 4 pictures; a thousand times or a thousandth of it "
+    "does.",
+    command=TRIED,
 )
-RING_OCTAVES = TABLE.stated(
+RING_OCTAVES = TABLE.measured(
     "RING_OCTAVES", 0.25, "octaves",
-    "Width of a ring: at PERIODS_MIN a lobe of the window takes half of one.",
+    "Width of a ring: at PERIODS_MIN a lobe of the window takes half of one. 1.5 times as large or as small, it "
+    "changes nothing in 4 pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Crossed waves, in crossed_waves.py
@@ -696,9 +771,11 @@ FOLLOWED_AMONG = TABLE.stated(
     "FOLLOWED_AMONG", 8, "frequencies",
     "Of so many of the clearest, the lowest are followed: distortions and waves change their phases least.",
 )
-NEWTON_STEPS = TABLE.stated(
+NEWTON_STEPS = TABLE.measured(
     "NEWTON_STEPS", 6, "steps",
-    "From an even lattice to the places by the phases; what has not arrived is left out.",
+    "From an even lattice to the places by the phases; what has not arrived is left out. With 4 or 9, 3 pictures "
+    "are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 
 # Gratings, in grating.py
@@ -707,18 +784,21 @@ LINES_POWER = TABLE.derived(
     "LINES_POWER", 200.0, "median power",
     "Of the lines, over others of their size: noise has a chance of 3e-55 in half a million values, 2^-200 each.",
 )
-ACROSS_POWER_MAX = TABLE.stated(
+ACROSS_POWER_MAX = TABLE.measured(
     "ACROSS_POWER_MAX", 0.1, "power of the lines",
     "At a frequency that is no multiple; from there on the pattern repeats across them as well. Equal crossed "
-    "lines, dots and squares have 1.",
+    "lines, dots and squares have 1. 1.5 times as large or as small, it changes nothing in 3 pictures; a thousand "
+    "times or a thousandth of it does.",
+    command=TRIED,
 )
 LINES_RING_OCTAVES = TABLE.stated(
     "LINES_RING_OCTAVES", 1.0, "octaves",
     "Frequencies of the same size, either way: at PERIODS_MIN some 70 are no multiples.",
 )
-LINES_DEGREE = TABLE.stated(
+LINES_DEGREE = TABLE.measured(
     "LINES_DEGREE", 5, "degree",
-    "Of the polynomial through all places.",
+    "Of the polynomial through all places. With 3 or 8, 2 pictures are decided alike.",
+    command=TRIED,
 )
 
 # The whole search, in detection.py
@@ -766,10 +846,12 @@ CHESS_MISFIT_MAX = TABLE.stated(
     "CHESS_MISFIT_MAX", 0.08, "of the power",
     "Of a checkerboard nothing but growth and blur changes the cell; photographs were seen to leave up to 0.004.",
 )
-CELL_ASYMMETRY_MAX = TABLE.stated(
+CELL_ASYMMETRY_MAX = TABLE.measured(
     "CELL_ASYMMETRY_MAX", 0.02, "of the power",
     "Seen: a hexagonal lattice of dots 0.05 or more, a square one with a blur of a sixth of the pitch, at 45 "
-    "degrees, 0.001.",
+    "degrees, 0.001. 1.5 times as large or as small, it changes nothing in 8 pictures; a thousand times or a "
+    "thousandth of it does.",
+    command=TRIED,
 )
 CLEAR_MISFIT = TABLE.stated(
     "CLEAR_MISFIT", 0.02, "of the power",
@@ -806,10 +888,12 @@ ALONG_SIGMA = TABLE.derived(
     "ALONG_SIGMA", 30.0, "sides of the picture",
     "1-sigma along the lines of a grating: a million places tell lengths along them to 30 sqrt(12 / 10^6) = 10 %.",
 )
-UNEVEN_MAX = TABLE.stated(
+UNEVEN_MAX = TABLE.measured(
     "UNEVEN_MAX", 0.04, "periods",
     "Departure of the lines of a grating from even distances. Seen: rough edges and noise as large as the "
-    "contrast 0.013, three lines of a circuit 0.06.",
+    "contrast 0.013, three lines of a circuit 0.06. 1.5 times as large or as small, it changes nothing in 2 "
+    "pictures; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Likely patterns, in pattern.py

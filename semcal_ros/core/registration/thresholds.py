@@ -22,6 +22,9 @@ from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
 
+# Of the measured rows: each says in how many cases it was tried, and what changed in them (doc/thresholds.md).
+TRIED = "python -m benchmarks.thresholds registration, 26 November 2026"
+
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
@@ -55,23 +58,29 @@ DEVIATIONS_MIN = TABLE.derived(
 
 # Believed shifts, in acceptance.py and one_direction.py
 
-STAGES_APART_PX_MAX = TABLE.stated(
+STAGES_APART_PX_MAX = TABLE.measured(
     "STAGES_APART_PX_MAX", 1.0, "px",
     "By which the fine shift may be off the coarse one, beyond the sample of the surface that the vertex of a "
-    "parabola is good to: for textures whose reduced images alias.",
+    "parabola is good to: for textures whose reduced images alias. 1.5 times as large or as small, it changes "
+    "nothing in 20 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 HALVES_SIGMAS = TABLE.derived(
     "HALVES_SIGMAS", 5.0, "sigma",
     "By which two halves of an image may differ by chance: along one axis, more is one in 1.7 million.",
 )
-HALVES_PX_MAX = TABLE.stated(
+HALVES_PX_MAX = TABLE.measured(
     "HALVES_PX_MAX", 0.3, "px",
     "By which they may differ, too, for distortion that is left in the images: a change of scale of 1 part in "
-    "1000 over the 300 px between the middles of halves of 600 px.",
+    "1000 over the 300 px between the middles of halves of 600 px. 1.5 times as large or as small, 21 cases are "
+    "decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-SAME_SHIFT_PX = TABLE.stated(
+SAME_SHIFT_PX = TABLE.measured(
     "SAME_SHIFT_PX", 0.5, "px",
-    "Shifts that were refined to within this distance of each other are one.",
+    "Shifts that were refined to within this distance of each other are one. 1.5 times as large or as small, it "
+    "changes nothing in 23 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Whether a reference and an image can be used, in register.py
@@ -103,18 +112,22 @@ PARTS_SIGNAL_MIN = TABLE.derived(
     "PARTS_SIGNAL_MIN", 0.3, "of the variance of the noise",
     "The same of the richest parts: those of 1550 images of noise, 192 to 768 px, had 0.21 at most.",
 )
-SIGNAL_SHARE_MIN = TABLE.stated(
+SIGNAL_SHARE_MIN = TABLE.measured(
     "SIGNAL_SHARE_MIN", 0.02, "of the whole variance",
-    "That the structure has, however large the noise is estimated: the correlation stays finite.",
+    "That the structure has, however large the noise is estimated: the correlation stays finite. 1.5 times as "
+    "large or as small, it changes nothing in 20 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 FARTHER_PX = TABLE.stated(
     "FARTHER_PX", 8.0, "px",
     "Along lines, by which an image that shows more than lines fits worse: beyond the width of any detail.",
 )
-PULL_PX_MAX = TABLE.stated(
+PULL_PX_MAX = TABLE.measured(
     "PULL_PX_MAX", 2.0, "px",
     "1-sigma of a shift with what a part may pull: one that may pull by more is another motion, and not one that "
-    "was not found.",
+    "was not found. 1.5 times as large or as small, it changes nothing in 17 cases; a thousand times or a "
+    "thousandth of it does.",
+    command=TRIED,
 )
 
 # Fixed pixels, in fixed_pixels.py and register.py
@@ -124,10 +137,11 @@ SMEARED_PX = TABLE.derived(
     "Around fixed pixels that the filters of gradients and of interpolation spoil, beyond the smoothing: farther "
     "out, those of smooth images have less than a twentieth of the squares of their weights.",
 )
-DROPPED_WITHIN_PX = TABLE.stated(
+DROPPED_WITHIN_PX = TABLE.measured(
     "DROPPED_WITHIN_PX", 1, "px",
     "By which the shift at which fixed pixels are dropped may be off the one that is found; farther away they are "
-    "dropped again, there.",
+    "dropped again, there. With 0 or 2, 25 cases are decided alike, and errors change by 0.13 % at most.",
+    command=TRIED,
 )
 DROPPED_MAX = TABLE.cost(
     "DROPPED_MAX", 3, "shifts",
@@ -136,14 +150,18 @@ DROPPED_MAX = TABLE.cost(
 
 # The specimen where not all moves with it, in specimen.py and register.py
 
-SPECIMEN_SHARE_MIN = TABLE.stated(
+SPECIMEN_SHARE_MIN = TABLE.measured(
     "SPECIMEN_SHARE_MIN", 0.85, "of the structure",
     "That agrees with a shift which is the specimen's by itself. Where less does, images are of two motions, "
-    "though no part was found to be one.",
+    "though no part was found to be one. With 0.775 or 0.9, it changes nothing in 25 cases; a thousand times or a "
+    "thousandth of it does.",
+    command=TRIED,
 )
-PREDICTED_SHARE_MIN = TABLE.stated(
+PREDICTED_SHARE_MIN = TABLE.measured(
     "PREDICTED_SHARE_MIN", 0.1, "of the structure",
-    "That agrees with any shift that is tried; whether it is the specimen's, a prediction may say then.",
+    "That agrees with any shift that is tried; whether it is the specimen's, a prediction may say then. 1.5 times "
+    "as large or as small, it changes nothing in 7 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 MAJORITY_SHARE = TABLE.derived(
     "MAJORITY_SHARE", 0.5, "of the structure",
@@ -153,9 +171,11 @@ WELL_PREDICTED_PX = TABLE.stated(
     "WELL_PREDICTED_PX", 1.0, "px",
     "1-sigma of a prediction that leaves no place for two motions.",
 )
-PREDICTED_PX_MAX = TABLE.stated(
+PREDICTED_PX_MAX = TABLE.measured(
     "PREDICTED_PX_MAX", 4.0, "px",
-    "1-sigma up to which a prediction is a start of its own, and says which motion is the specimen's.",
+    "1-sigma up to which a prediction is a start of its own, and says which motion is the specimen's. 1.5 times "
+    "as large or as small, it changes nothing in 7 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 HYPOTHESES_MAX = TABLE.cost(
     "HYPOTHESES_MAX", 3, "peaks",
@@ -177,73 +197,96 @@ MISSING_MAX = TABLE.stated(
     "Of a tile that may be missing: contrast changes with charging, focus and contamination by some tenths over a "
     "field.",
 )
-BESIDES_MAX = TABLE.stated(
+BESIDES_MAX = TABLE.measured(
     "BESIDES_MAX", 0.6, "of the structure",
-    "Of a tile that may be there besides, for the same reason.",
+    "Of a tile that may be there besides, for the same reason. With 0.733, 2 of 19 cases are decided otherwise; "
+    "with 0.4, 2 of 19 cases are decided otherwise and errors are 17 % larger.",
+    command=TRIED,
 )
 AGREEMENT_SIGMAS = TABLE.derived(
     "AGREEMENT_SIGMAS", 4.5, "sigma",
     "Of the noise by which a tile must exceed that, or have a shift of its own: by chance once in 300 000 tiles "
     "on one side, in 150 000 on both.",
 )
-TILE_SHIFT_PX_MAX = TABLE.stated(
+TILE_SHIFT_PX_MAX = TABLE.measured(
     "TILE_SHIFT_PX_MAX", 0.15, "px",
-    "Of a tile against the others, beyond the noise: distortion and interpolation leave some hundredths.",
+    "Of a tile against the others, beyond the noise: distortion and interpolation leave some hundredths. 1.5 "
+    "times as large, 1 of 19 cases is decided otherwise; as small, errors change by 1.2 %.",
+    command=TRIED,
 )
 SUSPECT_SIGMAS = TABLE.derived(
     "SUSPECT_SIGMAS", 3.5, "sigma",
     "From which a tile is looked at together with its neighbours: by chance one in 2100.",
 )
-BEST_TILES = TABLE.stated(
+BEST_TILES = TABLE.measured(
     "BEST_TILES", 0.3, "of the tiles",
-    "That fit best: what they leave is noise, of which interpolation hides some from where it is measured.",
+    "That fit best: what they leave is noise, of which interpolation hides some from where it is measured. 1.5 "
+    "times as large, 1 of 19 cases is decided otherwise; as small, errors change by less than 0.1 %.",
+    command=TRIED,
 )
-GAIN_MIN = TABLE.stated(
+GAIN_MIN = TABLE.measured(
     "GAIN_MIN", 0.3, "ratio of contrasts",
     "Of a tile whose gain counts: less is that of another place, and what came in has nothing in common with what "
-    "it covers.",
+    "it covers. 1.5 times as large or as small, 19 cases are decided alike, and errors change by 0.69 % at most.",
+    command=TRIED,
 )
-GAIN_RATIO_MAX = TABLE.stated(
+GAIN_RATIO_MAX = TABLE.measured(
     "GAIN_RATIO_MAX", 1.5, "of the median gain",
     "To either side, within which the gain of the image may be: what came in must not say how bright the specimen "
-    "is.",
+    "is. 1.5 times as large, 1 of 19 cases is decided otherwise; as small, 1 of 19 cases is decided otherwise.",
+    command=TRIED,
 )
-TELLING_TILES_MIN = TABLE.stated(
+TELLING_TILES_MIN = TABLE.measured(
     "TELLING_TILES_MIN", 12, "tiles",
-    "That tell a gain, or how a shift changes over the field; half as many tell what the tiles of a row share.",
+    "That tell a gain, or how a shift changes over the field; half as many tell what the tiles of a row share. "
+    "With 8 or 18, 19 cases are decided alike, and errors change by 0.74 % at most.",
+    command=TRIED,
 )
-TELLING_SIGMA_PX_MAX = TABLE.stated(
+TELLING_SIGMA_PX_MAX = TABLE.measured(
     "TELLING_SIGMA_PX_MAX", 0.5, "px",
-    "1-sigma of the shift of a tile; one that is less certain says nothing by it.",
+    "1-sigma of the shift of a tile; one that is less certain says nothing by it. 1.5 times as large or as small, "
+    "19 cases are decided alike, and errors change by 1.8 % at most.",
+    command=TRIED,
 )
-CHANGE_PRECISION = TABLE.stated(
+CHANGE_PRECISION = TABLE.measured(
     "CHANGE_PRECISION", 1e-3, "1 / px^2",
     "Prior of the terms of a shift that changes over the field, 1-sigma of 32 px about none: those that tiles in "
-    "a row leave open are none.",
+    "a row leave open are none. 1.5 times as large or as small, it changes nothing in 19 cases; a thousand times "
+    "or a thousandth of it does.",
+    command=TRIED,
 )
 STRETCH_PX_MAX = TABLE.derived(
     "STRETCH_PX_MAX", HALVES_PX_MAX, "px",
     "By which a shift may change from the middle of the rows to their ends, as halves of an image may disagree.",
 )
-COMPLETE_SHARE_MIN = TABLE.stated(
+COMPLETE_SHARE_MIN = TABLE.measured(
     "COMPLETE_SHARE_MIN", 0.97, "of the structure",
-    "That agrees with a shift where all of the image moves by it.",
+    "That agrees with a shift where all of the image moves by it. With 0.955 or 0.98, it changes nothing in 17 "
+    "cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-DISAGREEING_MAX = TABLE.stated(
+DISAGREEING_MAX = TABLE.measured(
     "DISAGREEING_MAX", 0.05, "of the tiles",
-    "That may disagree before most of them must be in bodies.",
+    "That may disagree before most of them must be in bodies. 1.5 times as large or as small, it changes nothing "
+    "in 5 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-BODY_TILES_MIN = TABLE.stated(
+BODY_TILES_MIN = TABLE.measured(
     "BODY_TILES_MIN", 4, "tiles",
-    "That make a body.",
+    "That make a body. With 6, 1 of 19 cases is decided otherwise; with 3, errors change by 1.6 %.",
+    command=TRIED,
 )
-MOVING_TILES_MIN = TABLE.stated(
+MOVING_TILES_MIN = TABLE.measured(
     "MOVING_TILES_MIN", 2, "tiles",
-    "Of a body that is said to move: one alone is chance, or a particle that blinks.",
+    "Of a body that is said to move: one alone is chance, or a particle that blinks. With 3, 1 of 5 cases is "
+    "decided otherwise; with 1, 1 of 5 cases is decided otherwise.",
+    command=TRIED,
 )
-STILL_SHIFT_PX_MIN = TABLE.stated(
+STILL_SHIFT_PX_MIN = TABLE.measured(
     "STILL_SHIFT_PX_MIN", 0.05, "px",
-    "Of a body where something moved in the image before: less of a shift is enough there.",
+    "Of a body where something moved in the image before: less of a shift is enough there. 1.5 times as large or "
+    "as small, 5 cases are decided alike, and errors change by 1.1 % at most.",
+    command=TRIED,
 )
 STILL_SIGMAS = TABLE.derived(
     "STILL_SIGMAS", 3.0, "sigma",
@@ -286,13 +329,16 @@ SOFTENED_PX = TABLE.stated(
     "SOFTENED_PX", 24, "px",
     "Side of the squares in which contrast is measured before periods are looked for: fine lattices repeat in one.",
 )
-PERIOD_PX_MIN = TABLE.stated(
+PERIOD_PX_MIN = TABLE.measured(
     "PERIOD_PX_MIN", 4.0, "px",
-    "What repeats faster is beyond the Nyquist limit of a scan that is sampled well.",
+    "What repeats faster is beyond the Nyquist limit of a scan that is sampled well. 1.5 times as large or as "
+    "small, it changes nothing in 8 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-REPEATED_MIN = TABLE.stated(
+REPEATED_MIN = TABLE.measured(
     "REPEATED_MIN", 0.6, "of the structure",
-    "That repeats.",
+    "That repeats. With 0.733, nothing changes; with 0.4, 1 of 8 cases is decided otherwise.",
+    command=TRIED,
 )
 DIP_MAX = TABLE.stated(
     "DIP_MAX", 0.7, "of what repeats",
@@ -331,17 +377,21 @@ DEFECT_SIGMAS = TABLE.derived(
     "By which one shift explains a tile better than another one where it is a defect: by chance one in 1.7 "
     "million tiles, on either side.",
 )
-DEFECT_EVIDENCE_MAX = TABLE.stated(
+DEFECT_EVIDENCE_MAX = TABLE.measured(
     "DEFECT_EVIDENCE_MAX", 30.0, "squared sigmas",
-    "Of a body of tiles that lie together. As much against a shift is a second motion.",
+    "Of a body of tiles that lie together. As much against a shift is a second motion. 1.5 times as large or as "
+    "small, it changes nothing in 4 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 EVIDENCE_MIN = TABLE.derived(
     "EVIDENCE_MIN", 2.0 * DEFECT_EVIDENCE_MAX, "squared sigmas",
     "That tells two shifts apart: two defects.",
 )
-COARSE_PERIOD_MIN = TABLE.stated(
+COARSE_PERIOD_MIN = TABLE.measured(
     "COARSE_PERIOD_MIN", 1.0 / 16.0, "of the shorter side",
-    "From which on a period is coarse.",
+    "From which on a period is coarse. 1.5 times as large or as small, it changes nothing in 4 cases; a thousand "
+    "times or a thousandth of it does.",
+    command=TRIED,
 )
 HALF_PERIOD_SIGMAS = TABLE.derived(
     "HALF_PERIOD_SIGMAS", 5.0, "sigma",
@@ -360,17 +410,23 @@ NOISE_POWER_SIGMA = TABLE.stated(
     "NOISE_POWER_SIGMA", 0.1, "of its power",
     "To which that of the noise is known.",
 )
-NOISE_POWER_MAX = TABLE.stated(
+NOISE_POWER_MAX = TABLE.measured(
     "NOISE_POWER_MAX", 2.0, "of the power across",
-    "Of the noise: more of it hides which way lines run.",
+    "Of the noise: more of it hides which way lines run. 1.5 times as large or as small, it changes nothing in 13 "
+    "cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-LINES_MOVED = TABLE.stated(
+LINES_MOVED = TABLE.measured(
     "LINES_MOVED", 0.25, "of the shorter side",
-    "By which an image is moved along its lines to tell their direction.",
+    "By which an image is moved along its lines to tell their direction. 1.5 times as large or as small, 13 cases "
+    "are decided alike.",
+    command=TRIED,
 )
-SAME_RIDGE_STEPS = TABLE.stated(
+SAME_RIDGE_STEPS = TABLE.measured(
     "SAME_RIDGE_STEPS", 3.0, "samples of the coarse search",
-    "Peaks that are nearer than this to each other across the lines are of one ridge.",
+    "Peaks that are nearer than this to each other across the lines are of one ridge. 1.5 times as large or as "
+    "small, it changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 HELD_SIGMA_PX = TABLE.defined(
     "HELD_SIGMA_PX", 1.0, "px",
@@ -390,26 +446,33 @@ PEAK_SIGMAS = TABLE.derived(
     "From which a peak is significant. A maximum over some 10^4 shifts of unrelated images stays below about 5, "
     "which as many normal deviates exceed in one of 350 images; 7, in one of 80 million.",
 )
-PEAK_CORRELATION_MIN = TABLE.stated(
+PEAK_CORRELATION_MIN = TABLE.measured(
     "PEAK_CORRELATION_MIN", 0.5, "correlation",
     "From which it is, too: on a lattice the whole surface oscillates, so that its spread says nothing; its "
-    "height does.",
+    "height does. 1.5 times as large, 1 of 24 cases is decided otherwise; as small, nothing changes.",
+    command=TRIED,
 )
-PEAK_HEIGHT_MIN = TABLE.stated(
+PEAK_HEIGHT_MIN = TABLE.measured(
     "PEAK_HEIGHT_MIN", 0.5, "of the highest",
-    "Of peaks that are listed; competitors must reach 0.7 of it.",
+    "Of peaks that are listed; competitors must reach 0.7 of it. 1.5 times as large or as small, it changes "
+    "nothing in 24 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 PEAKS_MAX = TABLE.cost(
     "PEAKS_MAX", 8, "peaks",
     "The highest, and as many of those nearest to the prediction.",
 )
-SHADING_PARTS = TABLE.stated(
+SHADING_PARTS = TABLE.measured(
     "SHADING_PARTS", 16.0, "parts of the field",
-    "The width of a blur that keeps shading, which is what is broader than an eighth of the field.",
+    "The width of a blur that keeps shading, which is what is broader than an eighth of the field. 1.5 times as "
+    "large or as small, 24 cases are decided alike, and errors change by 0.11 % at most.",
+    command=TRIED,
 )
-OVERLAP_SAMPLES_MIN = TABLE.stated(
+OVERLAP_SAMPLES_MIN = TABLE.measured(
     "OVERLAP_SAMPLES_MIN", 4.0, "samples",
-    "Along an axis; fewer do not make a correlation.",
+    "Along an axis; fewer do not make a correlation. 1.5 times as large or as small, it changes nothing in 24 "
+    "cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 SURFACES_KEPT = TABLE.cost(
     "SURFACES_KEPT", 6, "parts of a surface",
@@ -423,29 +486,38 @@ PARTS_SIDE_PX_MAX = TABLE.cost(
     "PARTS_SIDE_PX_MAX", 256, "px",
     "Longest side at which parts are compared: a part is then 64 px and more of most images.",
 )
-PARTS = TABLE.stated(
+PARTS = TABLE.measured(
     "PARTS", 3, "parts",
-    "Along each side.",
+    "Along each side. With 2 or 4, 3 cases are decided alike.",
+    command=TRIED,
 )
 PARTS_FOUND_MIN = TABLE.derived(
     "PARTS_FOUND_MIN", PARTS * (PARTS - 1), "parts",
     "That must be found for a pattern: one row may be missing.",
 )
-PART_CORRELATION_MIN = TABLE.stated(
+PART_CORRELATION_MIN = TABLE.measured(
     "PART_CORRELATION_MIN", 0.4, "correlation",
-    "Of a part that counts: that of 60 x 60 px of independent noise scatters by 1/60.",
+    "Of a part that counts: that of 60 x 60 px of independent noise scatters by 1/60. 1.5 times as large or as "
+    "small, 3 cases are decided alike.",
+    command=TRIED,
 )
-PART_LEAD_MIN = TABLE.stated(
+PART_LEAD_MIN = TABLE.measured(
     "PART_LEAD_MIN", 0.1, "correlation",
-    "Of such a part above that of any other place: six times the scatter of noise.",
+    "Of such a part above that of any other place: six times the scatter of noise. 1.5 times as large or as "
+    "small, it changes nothing in 3 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-PART_DEVIATION_PX_MAX = TABLE.stated(
+PART_DEVIATION_PX_MAX = TABLE.measured(
     "PART_DEVIATION_PX_MAX", 1.5, "px of the reduced image",
-    "RMS of the parts about one linear map.",
+    "RMS of the parts about one linear map. 1.5 times as large or as small, it changes nothing in 3 cases; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-DEFORMATION_MIN = TABLE.stated(
+DEFORMATION_MIN = TABLE.measured(
     "DEFORMATION_MIN", 0.01, "rad, or strain",
-    "Rotation or strain that is none by chance, as a pixel over the 170 px between the outer parts may be.",
+    "Rotation or strain that is none by chance, as a pixel over the 170 px between the outer parts may be. 1.5 "
+    "times as large or as small, it changes nothing in 3 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Noise and smoothing, in noise_spectrum.py
@@ -458,25 +530,33 @@ NOISE_SPECTRUM_PX = TABLE.cost(
     "NOISE_SPECTRUM_PX", 64, "px",
     "Side of the part whose spectrum tells the noise, to 7 %.",
 )
-RICH_PART_PX = TABLE.stated(
+RICH_PART_PX = TABLE.measured(
     "RICH_PART_PX", 32, "px",
-    "Side of the parts of a sparse image.",
+    "Side of the parts of a sparse image. With 21 or 48, it changes nothing in 1 case; a thousand times or a "
+    "thousandth of it does.",
+    command=TRIED,
 )
 RICH_PARTS = TABLE.stated(
     "RICH_PARTS", 4, "parts",
     "Of a sparse image that count: those that show most.",
 )
-SPECTRUM_RINGS = TABLE.stated(
+SPECTRUM_RINGS = TABLE.measured(
     "SPECTRUM_RINGS", 48, "rings",
-    "Of the spectrum, out to its corners.",
+    "Of the spectrum, out to its corners. With 72, the error of one case is 33 % smaller; with 32, errors change "
+    "by 1.4 % (25 cases).",
+    command=TRIED,
 )
-SMOOTHINGS_PX = TABLE.stated(
+SMOOTHINGS_PX = TABLE.measured(
     "SMOOTHINGS_PX", np.concatenate([[0.0], np.geomspace(0.4, 3.2, 19)]), "px",
-    "Widths of the Gaussian to choose from: in steps of 12 %, over which the variance of a shift is flat.",
+    "Widths of the Gaussian to choose from: in steps of 12 %, over which the variance of a shift is flat. 1.5 "
+    "times as large or as small, 25 cases are decided alike, and errors change by 1.5 % at most.",
+    command=TRIED,
 )
-NOISE_BAND = TABLE.stated(
+NOISE_BAND = TABLE.measured(
     "NOISE_BAND", 0.9, "of the Nyquist frequency",
-    "Beyond which, in the corners of the spectrum, what is found is noise.",
+    "Beyond which, in the corners of the spectrum, what is found is noise. With 0.933, errors are 6.4 % larger; "
+    "with 0.85, errors change by 1.5 % (25 cases).",
+    command=TRIED,
 )
 SMOOTHING_FREQUENCIES = TABLE.cost(
     "SMOOTHING_FREQUENCIES", 256, "frequencies",
@@ -497,19 +577,24 @@ FILTER_FREQUENCIES = TABLE.derived(
     "FILTER_FREQUENCIES", 64, "frequencies",
     "At which a filter of up to 16 taps is fitted: four times as many.",
 )
-FILTER_RIDGE = TABLE.stated(
+FILTER_RIDGE = TABLE.measured(
     "FILTER_RIDGE", 1e-9, "of the diagonal",
     "Of the normal matrix, added to it: what lies outside the band is left free, and this keeps the weights small "
-    "there.",
+    "there. 1.5 times as large or as small, 23 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-FLAT_BELOW = TABLE.stated(
+FLAT_BELOW = TABLE.measured(
     "FLAT_BELOW", 0.05, "(rad / px)^2",
-    "Squared frequency below which the power of an image is taken as constant.",
+    "Squared frequency below which the power of an image is taken as constant. 1.5 times as large or as small, 24 "
+    "cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-BAND_EDGES = TABLE.stated(
+BAND_EDGES = TABLE.measured(
     "BAND_EDGES", (0.72 * np.pi, 0.8 * np.pi), "rad / px",
     "Up to which filters are accurate: for images that are smooth, and for sharp ones with little noise. A shift "
-    "is then wrong by 1.2 % of a wave at most.",
+    "is then wrong by 1.2 % of a wave at most. 1.5 times as large or as small, 26 cases are decided alike, and "
+    "errors change by 1.1 % at most.",
+    command=TRIED,
 )
 BAND_TAPS = TABLE.stated(
     "BAND_TAPS", (12, 16), "weights",
@@ -518,13 +603,17 @@ BAND_TAPS = TABLE.stated(
 
 # Tiles, in tiles.py
 
-TILES_MIN = TABLE.stated(
+TILES_MIN = TABLE.measured(
     "TILES_MIN", 3, "tiles",
-    "Along a side that leave something to compare after gain and offset follow ramps.",
+    "Along a side that leave something to compare after gain and offset follow ramps. With 2 or 4, it changes "
+    "nothing in 24 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-SHARP_PX = TABLE.stated(
+SHARP_PX = TABLE.measured(
     "SHARP_PX", 0.3, "px",
-    "Smoothing below which images have structure beyond the band of the shorter filters.",
+    "Smoothing below which images have structure beyond the band of the shorter filters. 1.5 times as large or as "
+    "small, 24 cases are decided alike, and errors change by 2.5 % at most.",
+    command=TRIED,
 )
 HESSIAN_PIXELS = TABLE.cost(
     "HESSIAN_PIXELS", 12_000, "px",
@@ -535,9 +624,11 @@ ALL_PIXELS = TABLE.defined(
     "ALL_PIXELS", 2**62, "px",
     "More than an image has.",
 )
-HESSIAN_BANDS = TABLE.stated(
+HESSIAN_BANDS = TABLE.measured(
     "HESSIAN_BANDS", 3, "bands",
-    "In which they lie: at the top, in the middle and at the bottom of the overlap.",
+    "In which they lie: at the top, in the middle and at the bottom of the overlap. With 2 or 4, 23 cases are "
+    "decided alike, and errors change by 0.62 % at most.",
+    command=TRIED,
 )
 WINDOWS_KEPT = TABLE.cost(
     "WINDOWS_KEPT", 9, "windows",
@@ -589,34 +680,44 @@ REWEIGHTED_PASSES_MAX = TABLE.cost(
     "REWEIGHTED_PASSES_MAX", 8, "passes",
     "In which the weights of tiles may change.",
 )
-STEP_PX_MAX = TABLE.stated(
+STEP_PX_MAX = TABLE.measured(
     "STEP_PX_MAX", 1.5, "px",
-    "The gradient extrapolates over a pixel or two of a sharp image; longer steps may overshoot.",
+    "The gradient extrapolates over a pixel or two of a sharp image; longer steps may overshoot. 1.5 times as "
+    "large or as small, 23 cases are decided alike, and errors change by 0.93 % at most.",
+    command=TRIED,
 )
 COARSE_STEP_PX = TABLE.stated(
     "COARSE_STEP_PX", 0.2, "px of the level",
     "At which a coarse level is left: less than half a pixel of the next one.",
 )
-CONTRACTION = TABLE.stated(
+CONTRACTION = TABLE.measured(
     "CONTRACTION", 0.06, "of a step",
-    "What remains after it at most, beside CURVATURE.",
+    "What remains after it at most, beside CURVATURE. 1.5 times as large or as small, 23 cases are decided alike, "
+    "and errors change by 1.4 % at most.",
+    command=TRIED,
 )
-CURVATURE = TABLE.stated(
+CURVATURE = TABLE.measured(
     "CURVATURE", 0.5, "1 / px",
-    "What remains of the square of a step: one over the images' finest structure.",
+    "What remains of the square of a step: one over the images' finest structure. 1.5 times as large or as small, "
+    "23 cases are decided alike, and errors change by 1.5 % at most.",
+    command=TRIED,
 )
 REMAINING_SIGMAS = TABLE.derived(
     "REMAINING_SIGMAS", 0.12, "sigma",
     "That may remain: it adds 0.7 % to the error of the shift, sqrt(1 + 0.12^2).",
 )
-REMAINING_PX = TABLE.stated(
+REMAINING_PX = TABLE.measured(
     "REMAINING_PX", 5e-4, "px",
-    "That may remain in any case: below, errors of interpolation rule.",
+    "That may remain in any case: below, errors of interpolation rule. 1.5 times as large or as small, it changes "
+    "nothing in 23 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-BLOCK_SIGMAS = TABLE.stated(
+BLOCK_SIGMAS = TABLE.measured(
     "BLOCK_SIGMAS", 14.0, "widths of the smoothing",
     "Side of the blocks whose scores are independent: a Gaussian, applied to both images, correlates over some 4 "
-    "sigma to either side; blocks are over three times as large, so that little of their sums is shared.",
+    "sigma to either side; blocks are over three times as large, so that little of their sums is shared. 1.5 "
+    "times as large, errors over sigma are 5 % smaller; as small, errors change by 2.2 % (23 cases).",
+    command=TRIED,
 )
 BLOCKS_MIN = TABLE.derived(
     "BLOCKS_MIN", 36, "blocks",
@@ -626,22 +727,28 @@ FREEDOM_MIN = TABLE.stated(
     "FREEDOM_MIN", 8.0, "degrees of freedom",
     "Of few scores: the number of those that count is itself uncertain where it is small.",
 )
-FEW_SCORES = TABLE.stated(
+FEW_SCORES = TABLE.measured(
     "FEW_SCORES", 40.0, "scores",
-    "Fewer make up most of the information only where it lies in lone particles.",
+    "Fewer make up most of the information only where it lies in lone particles. 1.5 times as large or as small, "
+    "23 cases are decided alike, and errors change by 0.93 % at most.",
+    command=TRIED,
 )
-EXPECTED_SCORES = TABLE.stated(
+EXPECTED_SCORES = TABLE.measured(
     "EXPECTED_SCORES", 6.0, "scores",
     "As which the covariance counts then that the residuals of the pixels lead to: what moves a particle as a "
-    "whole, such as a change of its shape, is seen by the scatter of the scores alone.",
+    "whole, such as a change of its shape, is seen by the scatter of the scores alone. 1.5 times as large or as "
+    "small, 23 cases are decided alike, and errors change by 1.3 % at most.",
+    command=TRIED,
 )
 THREE_SIGMAS = TABLE.derived(
     "THREE_SIGMAS", 0.99865, "probability",
     "Of a normal deviate below three sigmas.",
 )
-SHEAR_ROWS_MIN = TABLE.stated(
+SHEAR_ROWS_MIN = TABLE.measured(
     "SHEAR_ROWS_MIN", 6, "rows of tiles",
-    "From which a change of the shift over the rows can be told apart from noise.",
+    "From which a change of the shift over the rows can be told apart from noise. With 4 or 9, it changes nothing "
+    "in 23 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 ROWS_PER_MODE = TABLE.stated(
     "ROWS_PER_MODE", 1.5, "rows of tiles",
@@ -665,9 +772,11 @@ CHANCE_SIGMAS = TABLE.derived(
     "By which the common information must exceed what chance gives: once in 3.5 million images of noise along an "
     "axis.",
 )
-PULL_SIDES = TABLE.stated(
+PULL_SIDES = TABLE.measured(
     "PULL_SIDES", (2, 3, 4, 6, 8, 11), "tiles",
-    "Sides of the squares that may move by themselves.",
+    "Sides of the squares that may move by themselves. 1.5 times as large, errors change by 3.5 %; as small, "
+    "errors over sigma are 13 % larger (17 cases).",
+    command=TRIED,
 )
 PULL_CHI2_MIN = TABLE.derived(
     "PULL_CHI2_MIN", 18.4, "chi-square, 2 degrees of freedom",
@@ -678,14 +787,17 @@ MEDIAN_CHI2 = TABLE.derived(
     "MEDIAN_CHI2", 1.386, "chi-square, 2 degrees of freedom",
     "The median: 2 log(2).",
 )
-PULL_EXCESS_MAX = TABLE.stated(
+PULL_EXCESS_MAX = TABLE.measured(
     "PULL_EXCESS_MAX", 3.0, "of the expected variance",
     "By which squares scatter where the images differ all over, as by charging; more than that is that of "
-    "motions.",
+    "motions. 1.5 times as large or as small, 17 cases are decided alike, and errors change by 2 % at most.",
+    command=TRIED,
 )
-PULL_REST_MIN = TABLE.stated(
+PULL_REST_MIN = TABLE.measured(
     "PULL_REST_MIN", 0.3, "of the information",
-    "That must be elsewhere: the specimen is no smaller part.",
+    "That must be elsewhere: the specimen is no smaller part. 1.5 times as large or as small, it changes nothing "
+    "in 17 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 ROUNDING = TABLE.cost(
     "ROUNDING", 1e-6, "of the largest variance",
@@ -698,28 +810,36 @@ AFFINE_STEPS_MAX = TABLE.cost(
     "AFFINE_STEPS_MAX", 200, "iterations",
     "Of the maximisation of the correlation.",
 )
-AFFINE_CONVERGED = TABLE.stated(
+AFFINE_CONVERGED = TABLE.measured(
     "AFFINE_CONVERGED", 1e-8, "correlation",
-    "Increase in an iteration below which the maximisation has converged.",
+    "Increase in an iteration below which the maximisation has converged. 1.5 times as large or as small, it "
+    "changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 AFFINE_SMOOTHED_PX = TABLE.stated(
     "AFFINE_SMOOTHED_PX", 1.5, "px",
     "Sigma of the Gaussian that both images are smoothed with: shot noise has no scale.",
 )
-AFFINE_CORRELATION_MIN = TABLE.stated(
+AFFINE_CORRELATION_MIN = TABLE.measured(
     "AFFINE_CORRELATION_MIN", 0.3, "correlation",
     "Below which images do not show the same, or noise hides it; at the shift that the alignment starts from, "
-    "half of it.",
+    "half of it. 1.5 times as large or as small, it changes nothing in 1 case; a thousand times or a thousandth "
+    "of it does.",
+    command=TRIED,
 )
 AFFINE_BORDER_PX = TABLE.stated(
     "AFFINE_BORDER_PX", 8, "px",
     "At the border, that are left out: interpolation and smoothing reach there.",
 )
-AFFINE_FLOOR_PX = TABLE.stated(
+AFFINE_FLOOR_PX = TABLE.measured(
     "AFFINE_FLOOR_PX", 0.02, "px",
-    "What interpolation leaves at the ends of the template, seen on noiseless textures.",
+    "What interpolation leaves at the ends of the template, seen on noiseless textures. 1.5 times as large, "
+    "errors over sigma are 25 % smaller; as small, errors over sigma are 24 % larger (1 case).",
+    command=TRIED,
 )
-AFFINE_LAGS_PX = TABLE.stated(
+AFFINE_LAGS_PX = TABLE.measured(
     "AFFINE_LAGS_PX", 8, "px",
-    "Up to which the correlation of the residuals is added up: that of white noise, smoothed so, is 0.1 % there.",
+    "Up to which the correlation of the residuals is added up: that of white noise, smoothed so, is 0.1 % there. "
+    "With 5 or 12, one case is decided alike, and its errors change by 0.47 %.",
+    command=TRIED,
 )
