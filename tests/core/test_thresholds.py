@@ -166,3 +166,26 @@ def test_sigmas_are_the_quantiles_of_the_normal_distribution() -> None:
     # Tables: 1.96 sigmas for 5 % on both sides, 3.09 for one in a thousand on one.
     assert sigmas_of_chance(0.05) == pytest.approx(1.959964, abs=1e-6)
     assert sigmas_of_chance(1e-3, sides=1) == pytest.approx(3.090232, abs=1e-6)
+
+
+def test_the_page_counts_the_sources_of_each_room() -> None:
+    kinds = [
+        Source.DERIVED,
+        Source.MEASURED,
+        Source.DEFINED,
+        Source.COST,
+        Source.STATED,
+    ]
+    page = (ROOT / "doc" / "thresholds.md").read_text(encoding="utf-8")
+    stated = {
+        cells[0].strip("`"): [int(cell) for cell in cells[1:]]
+        for line in page.splitlines()
+        if len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 1 + len(kinds)
+        and all(cell.isdigit() for cell in cells[1:])
+    }
+    counts = {
+        _name(own): [sum(row.source is kind for row in _table(own)[1]) for kind in kinds]
+        for own in ROOMS
+    }
+    together = [sum(column) for column in zip(*counts.values(), strict=True)]
+    assert stated == {**counts, "together": together}
