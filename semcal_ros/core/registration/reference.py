@@ -19,6 +19,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
@@ -29,6 +31,7 @@ from semcal_ros.core.registration.thresholds import (
     CORRELATION_MIN,
     DEVIATIONS_MIN,
     OVERLAP_MIN,
+    REPEATING_SHARE_MIN,
     SATURATED_MAX,
     SIGMA_PX_MAX,
 )
@@ -141,19 +144,27 @@ class Reference:
             return None
         return find_direction(self.levels, self.coarse.pyramid, self.noise_variance)
 
-    @cached_property
+    @property
     def periods(self) -> Array:
-        """(k, 2) periods of what repeats, px; looked for when first asked."""
-        if self.whole is not None:
-            return self.whole.periods
-        return find_periods(self.coarse.pyramid.centred(1), self.noise_variance)
+        """(k, 2) periods of what repeats in most of it, px; looked for when first asked."""
+        return self._lattice[0]
 
-    @cached_property
+    @property
     def repeats(self) -> Mask:
         """(h, w) of its region, where it shows its lattice; there must be :attr:`periods`."""
+        return self._lattice[1]
+
+    @cached_property
+    def _lattice(self) -> tuple[Array, Mask]:
         if self.whole is not None:
-            return self.whole.repeats
+            return self.whole._lattice
+        image = self.coarse.pyramid.centred(1)
+        periods = find_periods(image, self.noise_variance)
+        if not len(periods) or not self.levels:
+            return periods, np.zeros(image.shape, dtype=bool)
         level = self.levels[-1]
-        return find_repeating(
-            self.coarse.pyramid.centred(1), self.periods, level.sigma_px, max(level.side)
-        )
+        repeats = find_repeating(image, periods, level.sigma_px, max(level.side))
+        if repeats.mean() < REPEATING_SHARE_MIN:
+            # Among a few particles beside a tool, something is twice as far from a third as from another one.
+            return periods[:0], repeats
+        return periods, repeats

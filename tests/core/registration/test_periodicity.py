@@ -19,8 +19,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.periodicity import find_periods, find_repeating
+from semcal_ros.core.registration.register import prepare_reference
 from tests.helpers.drift_scenes import Texture
 
 SIZE = 256
@@ -95,3 +97,14 @@ def test_where_a_lattice_is_seen(rough: float) -> None:
     assert not np.any(seen[70:190, :90])
     assert np.all(seen[:, 120:])
     assert np.all(seen[:40])
+
+
+@pytest.mark.parametrize("seed", [100, 101, 102])
+def test_a_few_particles_beside_a_tool_are_no_lattice(seed: int) -> None:
+    """Some of them lie a period apart by chance: in a quarter of the picture, and not in most of it."""
+    frames, _, _ = draw(KINDS["tool over sparse"], seed)
+    by_chance = prepare_reference(frames[15])
+    assert len(find_periods(by_chance.coarse.pyramid.centred(1), by_chance.noise_variance)) > 0
+    assert len(by_chance.periods) == 0
+    with_tool, _, _ = draw(KINDS["tool over a lattice"], seed)
+    assert len(prepare_reference(with_tool[29]).periods) == 2
