@@ -106,6 +106,8 @@ def test_the_evidence_is_the_probability_of_the_data() -> None:
     assert np.diff(found) == pytest.approx(np.diff(true), rel=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kink", [False, True], ids=["smooth", "kinked"])
 def test_changes_fall_as_quickly_as_those_of_the_microscope(kink: bool) -> None:
     """Functions that are nearly straight leave less open between magnifications than those with a kink."""
