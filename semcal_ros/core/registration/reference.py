@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.arrays import Array, Image, Mask
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.normalised_correlation import CoarseReference
 from semcal_ros.core.registration.one_direction import OneDirection, find_direction
@@ -162,9 +162,16 @@ class Reference:
         periods = find_periods(image, self.noise_variance)
         if not len(periods) or not self.levels:
             return periods, np.zeros(image.shape, dtype=bool)
-        level = self.levels[-1]
-        repeats = find_repeating(image, periods, level.sigma_px, max(level.side))
+        repeats = self._find_repeating(image, periods)
         if repeats.mean() < REPEATING_SHARE_MIN:
-            # Among a few particles beside a tool, something is twice as far from a third as from another one.
+            # A few particles, with a tool or without, have periods by chance.
             return periods[:0], repeats
         return periods, repeats
+
+    def find_repeating(self, image: Image) -> Mask:
+        """(h, w) where an image shows the lattice; there must be :attr:`periods`."""
+        return self._find_repeating(image, self.periods)
+
+    def _find_repeating(self, image: Image, periods: Array) -> Mask:
+        level = self.levels[-1]
+        return find_repeating(image, periods, level.sigma_px, max(level.side))

@@ -63,7 +63,7 @@ from semcal_ros.core.registration.normalised_correlation import (
     find_coarse_peaks,
 )
 from semcal_ros.core.registration.one_direction import OneDirection, align_across
-from semcal_ros.core.registration.periodicity import find_repeating, is_fine
+from semcal_ros.core.registration.periodicity import is_fine
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.specimen import (
     find_moving,
@@ -556,15 +556,7 @@ def _register(
             guess,
             spread,
             noise_beside_tools(reference, pyramid),
-            (
-                reference.repeats,
-                find_repeating(
-                    pyramid.centred(1),
-                    reference.periods,
-                    reference.levels[-1].sigma_px,
-                    max(reference.levels[-1].side),
-                ),
-            ),
+            (reference.repeats, reference.find_repeating(pyramid.centred(1))),
         )
         if isinstance(told, ChosenShift):
             chosen = _peak_at(start, told.alignment), told.alignment

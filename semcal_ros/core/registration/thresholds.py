@@ -376,7 +376,7 @@ REPEATING_SHARE_MIN = TABLE.stated(
     "REPEATING_SHARE_MIN", 0.47, "of the image",
     "In which it repeats, if it is of a lattice: the least of 95 lattices, with vacancies, or a tool over half of the "
     "field, is 0.50. Periods that a few particles have by chance, with a tool or without, leave 0.03 to 0.45, in three "
-    "of 45 pictures 0.52 to 0.57.",
+    "of 45 pictures 0.52 to 0.57, and in one, with a period of most of its width, all of it.",
 )
 DEFECT_SIGMAS = TABLE.derived(
     "DEFECT_SIGMAS", 5.0, "robust sigma",

@@ -359,12 +359,14 @@ def estimate_changes(padded: Functions, problem: Problem, result: BundleResult) 
     :mod:`~semcal_ros.core.calibration.estimator.variance_components`: the squares of its coefficients but the first, in
     prior sigmas, over the number of them that the views determine.
     """
+    departure = result.state.theta - problem.prior_mean
     tried = [_changes_that_fall(padded, problem, result, by) for by in CHANGE_FALLS]
-    evidence = np.zeros(len(tried))
-    for k, sigma in enumerate(tried):
-        known = replace(problem, prior_sigma=sigma)
-        departure = result.state.theta - problem.prior_mean
-        evidence[k] = log_evidence(*result.equations(known), departure, sigma)
+    evidence = np.array(
+        [
+            log_evidence(*result.equations(replace(problem, prior_sigma=sigma)), departure, sigma)
+            for sigma in tried
+        ]
+    )
     return tried[int(np.argmax(evidence >= evidence.max() - FALL_DOUBT))]
 
 
@@ -372,7 +374,7 @@ def log_evidence(matrix: Array, right: Array, departure: Array, prior_sigma: Arr
     """Return the logarithm of the probability of the data with a prior, but for what all priors have in common.
 
     With the normal equations ``matrix`` (K, K) and ``right`` (K,) of a change of the unknowns, the prior in them, and
-    the (K,) ``departure`` of the unknowns from its mean (MacKay 1992, doi:10.1162/neco.1992.4.3.415, equation 2.4).
+    the (K,) ``departure`` of the unknowns from its mean (MacKay 1992, doi:10.1162/neco.1992.4.3.415).
     """
     scaled, scale = equilibrate(matrix)
     logarithm = np.linalg.slogdet(scaled)[1] - 2.0 * np.sum(np.log(scale))
