@@ -71,10 +71,10 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
     Returns
     -------
     None where nothing can be told: of different sizes, of a shift below
-    :data:`~semcal_ros.core.drift.thresholds.FIXED_MOVE_PX_MIN` or beyond half of the image, or where so much would stay
-    that the shift is in doubt.
+    :data:`~semcal_ros.core.drift.thresholds.FIXED_MOVE_PX_MIN` or beyond half of the image, or where the shift is in
+    doubt: so much would stay, or the rest of the image agrees better at the same place than at that to which it moved.
 
-    It fails where the specimen repeats by the shift, and on a wrong shift of a specimen that has not moved.
+    It fails where the specimen repeats by the shift.
     """
     if before.shape != now.shape or np.hypot(*shift_px) < FIXED_MOVE_PX_MIN:
         return None
@@ -115,7 +115,24 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
     if float(np.mean(stays)) > FIXED_SHARE_MAX:
         return None
     enlarged = grow_mask(stays, FIXED_ENLARGED_PX)
+    if not _has_moved(first, second, shift_px, known & ~enlarged):
+        return None
     return FixedParts(enlarged, np.asarray(moves & ~enlarged))
+
+
+def _has_moved(first: Image, second: Image, shift_px: Array, rest: Mask) -> bool:
+    """Whether the ``rest`` of two images agrees better at the place to which it moved than at the same place.
+
+    They are smoothed: interpolation takes away less of what noise is left then, and does not make the moved one agree.
+    """
+    sigma = GRADIENTS_SMOOTHED_PX
+    one, two = (cv2.GaussianBlur(image, (0, 0), sigma) for image in (first, second))
+    x, y = (-shift_px).tolist()
+    warp = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    there = cv2.warpAffine(one, warp, one.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    squares = [np.sum((two - other)[rest] ** 2, dtype=np.float64) for other in (there, one)]
+    return bool(squares[0] < squares[1])
 
 
 def share_of_gradients(image: AnyImage, part: Mask) -> float:

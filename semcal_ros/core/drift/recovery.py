@@ -119,7 +119,8 @@ def restart(
         if unmatched is not None and len(state.keyframes) > 2:
             # No frame has ever matched it.
             state = state.forget(unmatched)
-        state = replace(state, rejected=0, outliers=OutlierTest())
+        static = state.static.begin_again(is_in_doubt=unmatched is not None)
+        state = replace(state, rejected=0, outliers=OutlierTest(), static=static)
     return state, make_update(
         state,
         frame,

@@ -106,6 +106,14 @@ class StaticParts:
             return replace(self, before=image.copy())
         return self
 
+    def begin_again(self, *, is_in_doubt: bool) -> StaticParts:
+        """What is known where the drift goes on from a prediction: no frame before is one to compare with.
+
+        What stays in place is forgotten if it is in doubt: where no frame has matched what was left without it, it may
+        be the specimen.
+        """
+        return replace(self, earlier=None, fixed=None if is_in_doubt else self.fixed)
+
     def look_for_fixed(
         self, image: AnyImage, drift_px: Array, px_from_unit: Array
     ) -> tuple[StaticParts, Array | None]:

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +39,7 @@ from semcal_ros.core.drift.thresholds import (
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.reference import Reference, RegistrationSettings
 from semcal_ros.core.registration.register import register
+from semcal_ros.synthetic import LiveScene, Pose, drift_preset, preset
 from tests.helpers.drift_scenes import Texture
 
 SIZE = 224
@@ -107,6 +109,39 @@ def test_where_nothing_can_be_told_nothing_is_said() -> None:
     # A specimen that has not moved, and a drift that says so: all of it would stay.
     still = [picture((0.0, 0.0), k) for k in (0, 1)]
     assert find_fixed_parts(still[0], still[1], np.array([0.0, 12.0])) is None
+
+
+@pytest.mark.parametrize("believed", [(1.0, 0.5), (-26.0, 25.0)])
+def test_a_specimen_at_rest_is_not_what_stays(believed: tuple[float, float]) -> None:
+    """A small part of the image has structure, so that not much of it would stay; the shift is not the specimen's."""
+    rows, cols = np.mgrid[:SIZE, :SIZE]
+    board = ((rows // 9 + cols // 9) % 2 == 0) & (np.hypot(rows - 90, cols - 120) < 45)
+    pair = [
+        np.random.default_rng(k).normal(np.where(board, 60.0, 170.0), 5.0).clip(0, 255)
+        for k in (0, 1)
+    ]
+    first, second = (image.astype(np.uint8) for image in pair)
+    assert find_fixed_parts(first, second, np.array(believed)) is None
+
+
+def test_a_target_that_is_brought_to_rest_is_tracked() -> None:
+    """The stage turns a target too fast to be followed, and stops: what stands still then is the specimen, although the
+    drift that was predicted meanwhile says that it should have gone on.
+    """
+    scope = preset("jsm820").with_image_size(256, 256)
+    start = Pose.flat((40e-6, -28e-6, 0.0), math.radians(22.0))
+    scene = LiveScene(scope, "target", magnification=500.0, pose=start, drift=drift_preset("slow"))
+    tracker, camera, updates = DriftTracker(), scope.camera_at(500.0), []
+    for k in range(30):
+        # Slower from frame to frame, as a servo does it that comes to its goal.
+        part = 1.0 if k < 6 else 0.5 ** (k - 5)
+        time_s = 0.6 * k
+        scene.set_twist(time_s, (-9e-6 * part, 7e-6 * part), -0.07 * part)
+        image = scene.frame(time_s).image
+        updates.append(tracker.update(image, time_s, camera, scope.timing))
+    assert not updates[8].accepted
+    assert all(update.fixed_share == 0.0 for update in updates)
+    assert all(update.accepted for update in updates[-8:])
 
 
 def test_burnt_spots_do_not_hold_the_drift() -> None:
