@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Twist
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, Header
@@ -226,6 +228,8 @@ class VirtualSem(SemNode):
     def __init__(self) -> None:
         super().__init__("virtual_sem", _PARAMETERS)
         self._start_ns = self.get_clock().now().nanoseconds
+        # A frame may take longer to draw than to scan: the stage moves when it is told to, and not after that.
+        self._stage_lock = threading.RLock()
         self._mechanics = self._stage_with_faults()
         # Where x and y are, if a tilt does not move them.
         self._travel_m: tuple[float, float] | None = None
@@ -265,7 +269,13 @@ class VirtualSem(SemNode):
         self._announce_conditions()
         for name in ("voltage_v", "working_distance_m"):
             self.parameters.on_change(name, lambda _value: self._announce_conditions())
-        self._stage = self.create_subscription(Twist, "~/stage", self._on_stage, stream_output(10))
+        self._stage = self.create_subscription(
+            Twist,
+            "~/stage",
+            self._on_stage,
+            stream_output(10),
+            callback_group=MutuallyExclusiveCallbackGroup(),
+        )
         self._motion = MotionInterface(self.node_context, self)
         self._controls = [
             self.endpoints.trigger_service("~/start", self._start),
@@ -382,10 +392,11 @@ class VirtualSem(SemNode):
                     expected="a node that may move its stage",
                     do="start it with -p allow_motion:=true",
                 )
-            self._scene.set_twist(
-                self._now_s(), (message.linear.x, message.linear.y), message.angular.z
-            )
-            self._announce_stage()
+            with self._stage_lock:
+                self._scene.set_twist(
+                    self._now_s(), (message.linear.x, message.linear.y), message.angular.z
+                )
+                self._announce_stage()
         except SemcalError as error:
             self.reporter.reject(error)
 
@@ -398,8 +409,9 @@ class VirtualSem(SemNode):
     def _stop(self) -> str:
         was_running = not self._timer.is_canceled()
         self._timer.cancel()
-        self._scene.set_twist(self._now_s(), (0.0, 0.0))
-        self._announce_stage()
+        with self._stage_lock:
+            self._scene.set_twist(self._now_s(), (0.0, 0.0))
+            self._announce_stage()
         return "stopped, the stage too" if was_running else "not running"
 
     # -- what is asked of ~/move_stage and ~/set_magnification --------------------------------------
@@ -440,10 +452,11 @@ class VirtualSem(SemNode):
             self._set_pose(0.0)
         elif "x" in target or "y" in target:
             # A tilt about an axis that misses the specimen has brought it back to the beam by x and y.
-            now_s, before = self._now_s(), self.position()
-            x, y = self._scene.stage.position_at(now_s)[0]
-            way = [target.get(joint, before[joint]) - before[joint] for joint in ("x", "y")]
-            self._scene.place_stage(now_s, (float(x) + way[0], float(y) + way[1]))
+            with self._stage_lock:
+                now_s, before = self._now_s(), self.position()
+                x, y = self._scene.stage.position_at(now_s)[0]
+                way = [target.get(joint, before[joint]) - before[joint] for joint in ("x", "y")]
+                self._scene.place_stage(now_s, (float(x) + way[0], float(y) + way[1]))
         self._announce_stage()
 
     def set_magnification(self, magnification: float) -> None:
@@ -487,7 +500,10 @@ class VirtualSem(SemNode):
 
     def _announce_stage(self) -> None:
         """Publish where the stage is if it has moved."""
-        position, now_s = self._reading(), self._now_s()
+        with self._stage_lock:
+            self._announce_reading(self._reading(), self._now_s())
+
+    def _announce_reading(self, position: StagePosition | None, now_s: float) -> None:
         if self._joints is None or position is None or self.config.stage is None:
             return
         source = self.config.stage
@@ -534,7 +550,7 @@ class VirtualSem(SemNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the executable."""
-    return run_node(VirtualSem, args)
+    return run_node(VirtualSem, args, threads=2)
 
 
 if __name__ == "__main__":

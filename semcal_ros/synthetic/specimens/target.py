@@ -69,10 +69,11 @@ class TargetSpecimen:
         # target.
         box_m = np.hypot(footprint_m[:, 0], footprint_m[:, 1])
         seen = np.ones(x_m.shape, dtype=np.float32)
-        for level in range(self.target.levels):
+        first = self._first_level(x_m, y_m)
+        for level in range(first, self.target.levels):
             cell_m = self.target.cell_m(level)
             # Where a texel of the board around it is no larger than a sample, that one shows this one as well.
-            if level > 0 and RATIO * cell_m <= _CELL * float(box_m.min()):
+            if level > first and RATIO * cell_m <= _CELL * float(box_m.min()):
                 break
             _paint(seen, self.target, level, x_m / cell_m, y_m / cell_m, box_m / cell_m)
         seen *= np.float32(self.white - self.black)
@@ -86,6 +87,12 @@ class TargetSpecimen:
         if self.charging.gradient_per_m != (0.0, 0.0):
             seen *= np.asarray(self.charging.shade(x_m, y_m), dtype=np.float32)
         return np.asarray(np.maximum(seen, 0.0), dtype=np.float32)
+
+    def _first_level(self, x_m: Array, y_m: Array) -> int:
+        """The smallest board that covers all samples; those around it are hidden."""
+        far_m = max(abs(float(end)) for c in (x_m, y_m) for end in (c.min(), c.max()))
+        halves = [0.5 * RATIO * self.target.cell_m(k) for k in range(self.target.levels)]
+        return max((k for k, half in enumerate(halves) if far_m < half), default=0)
 
 
 def random_target(seed: int) -> TargetSpecimen:
@@ -117,14 +124,21 @@ def _paint(seen: Image, target: NestedTarget, level: int, x: Array, y: Array, bo
     inside = (np.abs(x) < half) & (np.abs(y) < half)
     if not np.any(inside):
         return
+    # A selection by a mask takes longer than the drawing.
+    whole = bool(np.all(inside))
+    if not whole:
+        x, y = x[inside], y[inside]
     pyramid = _make_pyramid(target, level)
     texels = max(float(np.max(box)) * _CELL, 1.0)
     step = min(math.ceil(math.log2(texels)), len(pyramid) - 1)
     board = pyramid[step]
     per_cell = len(board) / RATIO
-    u = _sharpen((x[inside] + half) * per_cell - 0.5, float(box[0]) * per_cell)
-    v = _sharpen((y[inside] + half) * per_cell - 0.5, float(box[1]) * per_cell)
-    seen[inside] = _remap_in_rows(board, u, v)
+    u = _sharpen((x + half) * per_cell - 0.5, float(box[0]) * per_cell)
+    v = _sharpen((y + half) * per_cell - 0.5, float(box[1]) * per_cell)
+    if whole:
+        seen[...] = _remap_in_rows(board, u.ravel(), v.ravel()).reshape(seen.shape)
+    else:
+        seen[inside] = _remap_in_rows(board, u, v)
 
 
 def _remap_in_rows(board: Image, u: Image, v: Image) -> Image:
