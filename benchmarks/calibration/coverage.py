@@ -33,7 +33,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from joblib import Parallel, delayed
 
-from benchmarks.table import quick_from_command_line, show
+from benchmarks.table import quick_from_command_line, show, text
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis
@@ -139,6 +139,8 @@ def main() -> None:
             row += [float(np.sqrt(np.mean(z**2))), f"{100.0 * np.mean(np.abs(z) < 1.96):.0f}"]
         row += [f"{100.0 * np.median([r[3] for r in results]):.2f}", sum(r[2] for r in results)]
         rows.append(row)
+        # The whole takes an hour and more; what is known is told at once.
+        print(*(text(value) for value in row), sep="  ", flush=True)
     show(
         f"Coverage of the stated uncertainty; {count} calibrations a row, {len(VISITS)} visits x 4 views",
         ["case", "px err/sigma", "95 %", "nm err/sigma", "95 %", "sigma of nm, %", "warned"],
