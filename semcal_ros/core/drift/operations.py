@@ -278,6 +278,11 @@ class Measure:
         Time that the frame took.
     zoom
         (2, 2) Z of :mod:`semcal_ros.core.drift.state`.
+
+    Raises
+    ------
+    InvalidValueError
+        If the measurement is not finite or its covariance not positive definite.
     """
 
     key: int
@@ -287,6 +292,20 @@ class Measure:
     acceleration_term_s2: float = 0.0
     scan_s: float = 0.0
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
+
+    def __post_init__(self) -> None:
+        # Here and not with each use: the likelihood of a process noise applies all measurements once more.
+        values = np.append(self.shift, self.covariance)
+        good = bool(np.all(np.isfinite(values)))
+        if good:
+            good = bool(np.all(np.diag(self.covariance) > 0.0))
+        if good:
+            good = float(np.linalg.eigvalsh(equilibrate(self.covariance)[0])[0]) > 0.0
+        if not good:
+            raise InvalidValueError(
+                f"measured shift {self.shift.tolist()} with covariance {self.covariance.tolist()}",
+                expected="finite numbers and a positive definite covariance",
+            )
 
     def widened(self, covariance: Array) -> Measure:
         """The same with a covariance (2, 2) added to that of the shift, and to that of the shear as if it had grown by
@@ -315,9 +334,12 @@ class Measure:
         Raises
         ------
         InvalidValueError
-            If the measurement is not finite or its covariance not positive definite.
+            If the state has no such keyframe.
         """
-        self._check(state)
+        if self.key not in state.keys:
+            raise InvalidValueError(
+                f"a measurement against keyframe {self.key}", expected=f"one of {state.keys}"
+            )
         jacobian = self.jacobian(state)
         count = self.shift.size
         noise = self.covariance + process_noise.frame_covariance(self.scan_s)[:count, :count]
@@ -341,23 +363,6 @@ class Measure:
         both = float(innovation @ inverse @ innovation)
         shear_nis = max(both - nis, 0.0)
         return MeasureOutcome(new, jacobian, innovation, expected, gain, nis, shear_nis)
-
-    def _check(self, state: DriftState) -> None:
-        if self.key not in state.keys:
-            raise InvalidValueError(
-                f"a measurement against keyframe {self.key}", expected=f"one of {state.keys}"
-            )
-        values = np.append(self.shift, self.covariance)
-        good = bool(np.all(np.isfinite(values)))
-        if good:
-            good = bool(np.all(np.diag(self.covariance) > 0.0))
-        if good:
-            good = float(np.linalg.eigvalsh(equilibrate(self.covariance)[0])[0]) > 0.0
-        if not good:
-            raise InvalidValueError(
-                f"measured shift {self.shift.tolist()} with covariance {self.covariance.tolist()}",
-                expected="finite numbers and a positive definite covariance",
-            )
 
     def without_shear(self) -> Measure:
         """The measurement without its shear."""

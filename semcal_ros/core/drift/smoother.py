@@ -76,11 +76,10 @@ _Step = Array | _Update | DriftState
 
 def _run_forward(
     start: DriftState, events: Sequence[Event], process_noise: ProcessNoise
-) -> Iterator[tuple[_Step, DriftState, float]]:
-    """The step and the state of each event, and its part of minus twice the log likelihood."""
+) -> Iterator[_Step]:
+    """The step of each event."""
     state = start
     for event in events:
-        cost = 0.0
         step: _Step
         if isinstance(event, Operation):
             transition = event.transition(state, process_noise)
@@ -92,11 +91,9 @@ def _run_forward(
             remaining = np.eye(state.mean.size) - outcome.gain @ outcome.jacobian
             inverse = invert_scaled(outcome.innovation_covariance)
             step = _Update(outcome.jacobian, outcome.innovation, inverse, remaining)
-            size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
-            cost = min(outcome.nis + outcome.shear_nis, MEASUREMENT_COST_MAX) + size
         else:
             step = state
-        yield step, state, cost
+        yield step
 
 
 def replay(start: DriftState, events: Sequence[Event], process_noise: ProcessNoise) -> DriftState:
@@ -142,7 +139,7 @@ def smooth(
     adjoint = np.zeros(last.mean.size)
     information = np.zeros((last.mean.size, last.mean.size))
     while blocks:
-        steps = [step for step, _, _ in _run_forward(*blocks.pop(), process_noise)]
+        steps = list(_run_forward(*blocks.pop(), process_noise))
         for step in reversed(steps):
             if isinstance(step, _Update):
                 weighted = step.jacobian.T @ step.inverse
@@ -218,12 +215,16 @@ def _maximise_likelihood(
         return replace(near, psd=psd, time_constant_s=time_constant_s)
 
     def cost(log_psd: float) -> float:
-        steps = _run_forward(start, events, with_density(log_psd))
-        costs = [
-            cost
-            for event, (_, _, cost) in zip(events, steps, strict=True)
-            if isinstance(event, Measure)
-        ]
+        process_noise, state = with_density(log_psd), start
+        costs: list[float] = []
+        for event in events:
+            if isinstance(event, Operation):
+                state = event(state, process_noise)
+            elif isinstance(event, Measure):
+                outcome = event(state, process_noise)
+                state = outcome.state
+                size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
+                costs.append(min(outcome.nis + outcome.shear_nis, MEASUREMENT_COST_MAX) + size)
         return sum(costs[MEASUREMENTS_UNCOUNTED:], start=0.0)
 
     grid = np.linspace(*DENSITY_LOG_RANGE, DENSITY_GRID)
