@@ -144,6 +144,29 @@ def test_a_target_that_is_brought_to_rest_is_tracked() -> None:
     assert all(update.accepted for update in updates[-8:])
 
 
+def test_no_frame_from_before_the_specimen_was_lost_is_compared_with() -> None:
+    tracker = DriftTracker()
+    for k in range(4):
+        tracker.update(picture((2.0 * k, 0.0), k), float(k))
+    assert tracker.state is not None
+    assert tracker.state.static.earlier is not None
+    spots_then = tracker.state.static.fixed
+    assert spots_then is not None
+    restarts = 0
+    for k in range(4, 24):
+        # Another place in each frame, so that none ever matches the one that tracking began again with.
+        elsewhere = 110.0 + SCALE * Texture(70 + k).view((0.0, 0.0), SIZE)
+        image = np.random.default_rng(k).normal(elsewhere, 6.0).clip(0, 255).astype(np.uint8)
+        restarted = tracker.update(image, float(k)).restarted
+        if restarted:
+            restarts += 1
+            static = tracker.state.static
+            assert static.earlier is None
+            # The first time, the spots are what they were; then they may be why nothing matches.
+            assert (static.fixed is None) == (restarts > 1)
+    assert restarts > 1
+
+
 def test_burnt_spots_do_not_hold_the_drift() -> None:
     tracker = DriftTracker()
     errors, sigmas = [], []
