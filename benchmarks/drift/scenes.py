@@ -348,8 +348,10 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def draw(kind: Kind, seed: int) -> tuple[list[NDArray[np.uint8]], Floats, float]:
-    """The frames of a scene, its drift (n, 2) in px, and the bound of a frame, px RMS of both axes together."""
+def draw(
+    kind: Kind, seed: int, count: int | None = None
+) -> tuple[list[NDArray[np.uint8]], Floats, float]:
+    """The frames of a scene, or the first of them, its drift (n, 2) in px, and the bound of a frame, px RMS of both axes together."""
     rng = np.random.default_rng(seed)
     ground = kind.ground(rng)
     spectrum = np.fft.rfft2(ground)
@@ -365,7 +367,7 @@ def draw(kind: Kind, seed: int) -> tuple[list[NDArray[np.uint8]], Floats, float]
     foreground_seed = int(rng.integers(1 << 30))
     margin = (TORUS - SIZE) // 2
     frames, bounds = [], []
-    for k, (dx, dy) in enumerate(drift):
+    for k, (dx, dy) in enumerate(drift[:count]):
         moved = np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (fx * dx + fy * dy)), (TORUS, TORUS))
         view = moved[margin : margin + SIZE, margin : margin + SIZE]
         clean = kind.foreground(
