@@ -168,7 +168,7 @@ def _no_strip() -> InvalidValueError:
 
 def _prepare_lines(smooth: Array) -> _Lines:
     # The border of the image is not an edge.
-    gy, gx = (np.ascontiguousarray(part[3:-3, 3:-3]) for part in np.gradient(smooth))
+    gy, gx = (np.asarray(part)[3:-3, 3:-3] for part in np.gradient(smooth))
     height, width = smooth.shape
     return _Lines(gx, gy, np.arange(3.0, width - 3), np.arange(3.0, height - 3), (width, height))
 
