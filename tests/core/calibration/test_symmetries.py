@@ -30,7 +30,7 @@ from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.made_once import made_once
 
 JSM = preset("jsm820")
-MAGNIFICATIONS = (250.0, 1000.0, 4000.0)
+MAGNIFICATIONS = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
 POINTS = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-0.3, 0.3)])
 MIDDLE = 0.5 * (np.array(JSM.image_size) - 1.0)
 HALF_TURN, QUARTER_TURN = -np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])
