@@ -24,12 +24,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from semcal_ros import Calibration, SemcalError
-from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.records import LadderRecord
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.report.calibration.curves import parts_by_specimen
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.stage import grid_views
+from tests.helpers.calibrations import calibrated
 from tests.helpers.node_scenes import make_calibration, texture
 
 MICROSCOPE = preset("jsm820")
@@ -37,9 +36,8 @@ MICROSCOPE = preset("jsm820")
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    views = grid_views(MICROSCOPE.camera_at, [500.0, 1000.0, 4000.0], views=3, noise_px=0.05)
-    result = calibrate_views(views, image_size=(512, 512), display_width_m=0.12)
-    return Calibration.from_model(result.model)
+    seen = (500.0, 1000.0, 2000.0, 4000.0)
+    return Calibration.from_model(calibrated("jsm820", magnifications=seen, views=3).model)
 
 
 def test_loads_of_one_file_are_equal(calibration, tmp_path):
@@ -63,7 +61,7 @@ def test_a_calibration_with_another_number_is_another_one(calibration):
 
 def test_its_text_is_one_line_of_what_matters(calibration):
     text = repr(calibration)
-    assert text.startswith("Calibration(joint, 500x to 4000x, 512 x 512 px, 9 views, RMS 0.0")
+    assert text.startswith("Calibration(joint, 500x to 4000x, 512 x 512 px, 12 views, RMS 0.0")
     assert "held-out RMS 0." in text and text.endswith(" px)")
     assert "\n" not in text and len(text) < 120
 
@@ -71,7 +69,7 @@ def test_its_text_is_one_line_of_what_matters(calibration):
 def test_its_table_holds_the_same(calibration):
     table = calibration._repr_html_()
     assert table.count("<tr>") == 6
-    for cell in ("500x to 4000x", "512 x 512 px", "<td>9</td>", "held-out RMS"):
+    for cell in ("500x to 4000x", "512 x 512 px", "<td>12</td>", "held-out RMS"):
         assert cell in table
     edited = Calibration.from_model(replace(calibration, method="<b>", statistics={"views": "no"}))
     assert "<b>" not in edited._repr_html_()

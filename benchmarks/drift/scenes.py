@@ -57,14 +57,21 @@ Rng = np.random.Generator
 def _discs(rng: Rng, count: int, radii: tuple[float, float], level: tuple[float, float]) -> Floats:
     """Soft discs at random places, four times oversampled."""
     out = np.zeros((TORUS, TORUS))
-    y, x = np.mgrid[:TORUS, :TORUS].astype(np.float64)
+    edge_px, most = 0.6, 50
     for _ in range(count):
-        cx, cy = rng.uniform(0, TORUS, 2)
+        centre = rng.uniform(0, TORUS, 2)
         r, bright = rng.uniform(*radii), rng.uniform(*level)
-        dx = (x - cx + TORUS / 2) % TORUS - TORUS / 2
-        dy = (y - cy + TORUS / 2) % TORUS - TORUS / 2
-        inside = 1.0 / (1.0 + np.exp(np.clip((np.hypot(dx, dy) - r) / 0.6, -50, 50)))
-        out = np.maximum(out, bright * inside)
+        # Farther away a disc is as dark as it gets.
+        reach = int(np.ceil(r + edge_px * most)) + 1
+        beside = np.arange(min(2 * reach + 1, TORUS)) - reach
+        x, y = ((int(c) + beside) % TORUS for c in centre)
+        dx, dy = (
+            (at - c + TORUS / 2) % TORUS - TORUS / 2 for at, c in zip((x, y), centre, strict=True)
+        )
+        away = np.hypot(dx[None, :], dy[:, None]) - r
+        inside = 1.0 / (1.0 + np.exp(np.clip(away / edge_px, -most, most)))
+        part = np.ix_(y, x)
+        out[part] = np.maximum(out[part], bright * inside)
     return out
 
 
@@ -348,8 +355,13 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def draw(kind: Kind, seed: int) -> tuple[list[NDArray[np.uint8]], Floats, float]:
-    """The frames of a scene, its drift (n, 2) in px, and the bound of a frame, px RMS of both axes together."""
+def draw(
+    kind: Kind, seed: int, count: int | None = None
+) -> tuple[list[NDArray[np.uint8]], Floats, float]:
+    """The frames of a scene, or the first of them, its drift (n, 2) in px, and the bound of a frame.
+
+    The bound is in px RMS of both axes together.
+    """
     rng = np.random.default_rng(seed)
     ground = kind.ground(rng)
     spectrum = np.fft.rfft2(ground)
@@ -365,7 +377,7 @@ def draw(kind: Kind, seed: int) -> tuple[list[NDArray[np.uint8]], Floats, float]
     foreground_seed = int(rng.integers(1 << 30))
     margin = (TORUS - SIZE) // 2
     frames, bounds = [], []
-    for k, (dx, dy) in enumerate(drift):
+    for k, (dx, dy) in enumerate(drift[:count]):
         moved = np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (fx * dx + fy * dy)), (TORUS, TORUS))
         view = moved[margin : margin + SIZE, margin : margin + SIZE]
         clean = kind.foreground(

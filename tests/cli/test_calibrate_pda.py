@@ -30,11 +30,9 @@ from semcal_ros.core.calibration.views import SquareAssignment
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.workflows.calibrate import CalibrateOptions, RecordingCalibration
 from semcal_ros.workflows.find_grid import CollectedViews
-from tests.helpers.calibrations import calibrated
+from tests.helpers.calibrations import CALIBRATED_EVENLY, calibrated
 from tests.helpers.semcal_runs import refused, run
 
-# Enough for an equation of the third order with an error of its own.
-MAGNIFICATIONS = (100.0, 1200.0, 2700.0, 5100.0, 7600.0, 10000.0)
 VIEWS = 3
 
 # A calibration takes some seconds.
@@ -46,7 +44,7 @@ def printed(monkeypatch, tmp_path, capsys):
     """What the command prints for corners that are found already, and the calibration file."""
 
     def found(_recording, asked: CalibrateOptions, **_):
-        result = calibrated("jsm820", asked.of_core(), MAGNIFICATIONS, VIEWS)
+        result = calibrated("jsm820", asked.of_core(), CALIBRATED_EVENLY, VIEWS)
         nothing = np.zeros(0)
         squares = SquareAssignment(nothing, 1.0, nothing)
         collected = CollectedViews((), (), (), squares, result.model.image_size)
@@ -135,7 +133,7 @@ def test_focal_length_and_skew_are_the_papers(printed):
 
 
 def test_other_methods_print_no_equations(printed):
-    for arguments in (("--method", "discrete"), ("--method", "pda", "--legendre", 2)):
+    for arguments in (("--method", "discrete"), ("--method", "pda", "--legendre", 3)):
         out, cal = printed(*arguments)
         assert cal.equations == ()
         assert "dx/du" not in out

@@ -24,6 +24,7 @@ import yaml
 
 from semcal_ros import Calibration
 from semcal_ros.files.recordings import open_recording
+from tests.helpers.made_once import folder_once
 from tests.helpers.semcal_runs import refused, run
 
 OTHER_VOLTAGE = (
@@ -33,9 +34,12 @@ OTHER_VOLTAGE = (
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder() -> Path:
     """A calibration, and two recordings of the grid by other seeds."""
-    place = tmp_path_factory.mktemp("check")
+    return folder_once("check", _record_and_calibrate)
+
+
+def _record_and_calibrate(place: Path) -> None:
     magnifications = [part for g in (600, 1500, 4000) for part in ("--magnification", g)]
     common = ("simulate", "--size", 256, "--plan", "grid", *magnifications)
     assert run(*common, place / "grid", "--views", 4) == 0
@@ -47,7 +51,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # And it was made at half of the voltage.
     data["provenance"]["conditions"]["acceleration_voltage_v"] = [5000.0, 5000.0]
     (place / "off.yaml").write_text(yaml.safe_dump(data))
-    return place
 
 
 @pytest.mark.slow

@@ -25,30 +25,21 @@ import yaml
 from semcal_ros import Calibration, SemcalError
 from semcal_ros.bridge.calibration import MAX_TEXT_BYTES
 from semcal_ros.core.calibration.options import CalibrationOptions
-from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES, TERM_NAMES
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.camera.residual_field import zero_field
 from semcal_ros.core.errors import CalibrationFileError
-from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.stage import grid_views
+from tests.helpers.calibrations import calibrated
+
+MAGNIFICATIONS = (500.0, 1000.0, 2000.0, 4000.0)
 
 
 @pytest.fixture(scope="module", params=["joint", "discrete", "pda"])
 def calibration(request):
-    microscope = preset("jsm820")
-    views = grid_views(
-        microscope.camera_at, [500.0, 1000.0, 2000.0, 4000.0], views=3, noise_px=0.05
-    )
-    result = calibrate_views(
-        views,
-        image_size=(512, 512),
-        display_width_m=0.12,
-        options=CalibrationOptions(request.param),
-    )
-    return Calibration.from_model(result.model)
+    options = CalibrationOptions(request.param)
+    return Calibration.from_model(calibrated("jsm820", options, MAGNIFICATIONS, 3).model)
 
 
 @pytest.mark.slow

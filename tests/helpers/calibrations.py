@@ -30,6 +30,8 @@ from tests.helpers.made_once import made_once
 NOISE_PX = 0.05
 CALIBRATED = (100.0, 300.0, 800.0, 1800.0, 3500.0, 6000.0, 10000.0)
 DEFAULT = CalibrationOptions()
+#: Magnifications of the paper's methods: enough for an equation of the third order with an error of its own.
+CALIBRATED_EVENLY = (100.0, 1200.0, 2700.0, 5100.0, 7600.0, 10000.0)
 #: Magnifications that no calibration has seen.
 BETWEEN = (170.0, 500.0, 1300.0, 2600.0, 4800.0, 8000.0)
 

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,11 +89,22 @@ class Board:
 
     def board_from_image(self, xy: Array) -> Array:
         """(n, 2) board points of pixels (n, 2); the division model's exact inverse."""
-        q = xy - self.centre
-        scale = self.distortion / (self.width / 2.0) ** 2
-        q = q / (1.0 + scale * (q * q).sum(axis=1, keepdims=True))
-        h = np.column_stack([q, np.ones(len(q))]) @ np.linalg.inv(self.homography).T
-        return h[:, :2] / h[:, 2:]
+        x, y = (xy[:, k] - self.centre[k] for k in range(2))
+        if self.distortion:
+            scale = self.distortion / (self.width / 2.0) ** 2
+            divisor = 1.0 + scale * (x * x + y * y)
+            x, y = x / divisor, y / divisor
+        u, v, w = (a * x + b * y + c for a, b, c in np.linalg.inv(self.homography))
+        # One column after the other in memory, which is what costs time.
+        return np.array([u / w, v / w]).T
+
+    def _beside(self, xy: Array, steps: Array) -> Iterator[Array]:
+        """Board points (n, 2) of the places beside pixels (n, 2) at all pairs of steps, px."""
+        straight = self.distortion == 0.0 and self.perspective == 0.0
+        uv, across = self.board_from_image(xy), np.linalg.inv(self.homography)[:2, :2]
+        for dx in steps:
+            for dy in steps:
+                yield uv + across @ [dx, dy] if straight else self.board_from_image(xy + [dx, dy])
 
     def corners(self, margin: float = 6.0) -> tuple[NDArray[np.int64], Array]:
         """Indices and pixels of the corners at least ``margin`` px inside the image."""
@@ -112,10 +124,10 @@ class Board:
         inside = np.all((xy >= margin) & (xy <= size - 1 - margin), axis=1) & back
         return ij[inside].astype(np.int64), xy[inside]
 
-    def _bright(self, xy: Array) -> Array:
-        """(n,) 1 where the board is bright at pixel positions (n, 2), else 0."""
-        uv = self.board_from_image(xy)
-        bright = (np.floor(uv).sum(axis=1) % 2 == 0) != self.inverted
+    def _bright(self, uv: Array) -> Array:
+        """(n,) 1 where the board is bright at board points (n, 2), else 0."""
+        whole = np.floor(uv)
+        bright = ((whole[:, 0] + whole[:, 1]).astype(np.int64) & 1 == 0) != self.inverted
         if self.growth_px > 0:
             bright |= np.abs(uv - np.round(uv)).min(axis=1) < self.growth_px / self.square_px
         if self.bounds is not None:
@@ -132,19 +144,19 @@ class Board:
         x = np.arange(-margin, self.width + margin, dtype=np.float64)
         y = np.arange(-margin, self.height + margin, dtype=np.float64)
         grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        uv = self.board_from_image(grid).reshape(len(y), len(x), 2)
+        points = self.board_from_image(grid)
+        uv = points.reshape(len(y), len(x), 2)
         step_y, step_x = np.gradient(uv, axis=(0, 1))
         reach = 0.6 * (np.abs(step_x) + np.abs(step_y))
         reach += self.growth_px / self.square_px
         crossed = np.any(np.abs(uv - np.round(uv)) < reach, axis=2).ravel()
-        total = self._bright(grid)
+        total = self._bright(points)
         # Slightly off the centre, so that no sample lies exactly on an edge in a symmetric
         # position.
         steps = (np.arange(samples) + 0.4837) / samples - 0.5
         fine = np.zeros(int(crossed.sum()))
-        for dx in steps:
-            for dy in steps:
-                fine += self._bright(grid[crossed] + [dx, dy])
+        for beside in self._beside(grid[crossed], steps):
+            fine += self._bright(beside)
         total[crossed] = fine / samples**2
         picture = total.reshape(len(y), len(x))
         if self.blur_px > 0:
@@ -241,8 +253,7 @@ class PatternBoard(Board):
     width: int = 240
     height: int = 200
 
-    def _bright(self, xy: Array) -> Array:
-        uv = self.board_from_image(xy)
+    def _bright(self, uv: Array) -> Array:
         nearest = np.rint(uv)
         off = np.abs(uv - nearest)
         if self.pattern == "dots":
@@ -263,9 +274,8 @@ class PatternBoard(Board):
         steps = (np.arange(samples) + 0.5) / samples - 0.5
         y, x = np.mgrid[0.0 : shape[0], 0.0 : shape[1]] - margin
         grid = np.stack([x.ravel(), y.ravel()], axis=1)
-        for dx in steps:
-            for dy in steps:
-                total += self._bright(grid + [dx, dy]).reshape(shape)
+        for beside in self._beside(grid, steps):
+            total += self._bright(beside).reshape(shape)
         blurred = cv2.GaussianBlur(total / samples**2, (0, 0), self.blur_px)
         return np.asarray(blurred[margin:-margin, margin:-margin], dtype=np.float64)
 

@@ -34,8 +34,11 @@ def surface(seed: int, cell_px: float = 4.0) -> Surface:
     waves, phases = rng.normal(0.0, 1.0 / cell_px, (100, 2)), rng.uniform(0.0, 2.0 * np.pi, 100)
 
     def height(x: Array, y: Array) -> Array:
-        parts = (np.cos(a * x + b * y + phase) for (a, b), phase in zip(waves, phases, strict=True))
-        return np.asarray(sum(parts) / np.sqrt(50.0))
+        total = np.zeros(np.shape(x))
+        for (a, b), phase in zip(waves, phases, strict=True):
+            # A cosine in single precision, good to a thousandth of a grey level, is several times as fast.
+            total += np.cos((a * x + b * y + phase).astype(np.float32))
+        return np.asarray(total / np.sqrt(50.0))
 
     return height
 

@@ -31,6 +31,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from tests.helpers.project import NODES
+from tests.helpers.semcal_runs import run
 
 pytestmark = pytest.mark.slow
 
@@ -53,34 +54,17 @@ def observer() -> Iterator[Node]:
     context.try_shutdown()
 
 
-@pytest.fixture(scope="module")
-def arguments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+def _arguments(name: str, folder: Path) -> list[str]:
     """What an executable cannot start without."""
-    bag = tmp_path_factory.mktemp("bag") / "tiny"
-    subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "semcal_ros",
-            "simulate",
-            str(bag),
-            "--plan",
-            "drift",
-            "--frames",
-            "2",
-            "--size",
-            "64",
-        ],
-        check=True,
-        capture_output=True,
-        timeout=120,
-    )
-    folder = tmp_path_factory.mktemp("pictures")
-    journal = ["-p", f"journal:={folder / 'journal'}"]
-    return {
-        "bag_player": ["--ros-args", "-p", f"bag:={bag}", "-p", "loop:=true"],
-        "microscope": ["--ros-args", "-p", f"folder:={folder}", *journal],
-    }
+    if name == "bag_player":
+        bag = folder / "tiny"
+        assert run("simulate", bag, "--plan", "drift", "--frames", 2, "--size", 64) == 0
+        return ["--ros-args", "-p", f"bag:={bag}", "-p", "loop:=true"]
+    if name == "microscope":
+        (folder / "pictures").mkdir()
+        journal = ["-p", f"journal:={folder / 'journal'}"]
+        return ["--ros-args", "-p", f"folder:={folder / 'pictures'}", *journal]
+    return []
 
 
 def _wait_for(observer: Node, name: str, process: subprocess.Popen[str]) -> None:
@@ -109,10 +93,10 @@ STOPS = [
 @pytest.mark.flaky(reruns=1)
 @pytest.mark.parametrize(("name", "stop"), STOPS, ids=[f"{n}-{s.name.lower()}" for n, s in STOPS])
 def test_an_executable_starts_and_stops(
-    name: str, stop: signal.Signals, observer: Node, arguments: dict[str, list[str]]
+    name: str, stop: signal.Signals, observer: Node, tmp_path: Path
 ) -> None:
     process = subprocess.Popen(
-        [str(_executable(name)), *arguments.get(name, [])],
+        [str(_executable(name)), *_arguments(name, tmp_path)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -25,6 +25,7 @@ import pytest
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.report import write_calibration_report
+from semcal_ros.report.html import encode
 from tests.helpers.made_once import folder_once, made_once
 from tests.helpers.report_samples import DISPLAY_M, HOSTILE, SIZE, found_of, grid_view, unused
 
@@ -55,6 +56,13 @@ def page_path(result: CalibrationResult) -> Path:
 def _write(result: CalibrationResult, folder: Path) -> None:
     path = folder / "report.html"
     path.write_text("an older report")
+    with pytest.MonkeyPatch.context() as patch:
+        # Coarse figures: they are looked at elsewhere.
+        patch.setattr(encode, "_FIGURE_DPI", 48.0)
+        _write_report(result, path)
+
+
+def _write_report(result: CalibrationResult, path: Path) -> None:
     written = write_calibration_report(
         result,
         path,

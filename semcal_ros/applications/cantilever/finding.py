@@ -20,7 +20,7 @@ derivative). Texture averages out; a strip leaves a rising and a falling line cl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -88,14 +88,20 @@ class _Lines:
     x: Array
     y: Array
     size: tuple[int, int]
+    # Several strips may lie in one direction.
+    known: dict[float, tuple[Array, float]] = field(default_factory=dict)
 
     def across(self, angle: float) -> tuple[Array, float]:
         """Sum along lines in a direction: sums by distance from the origin, first distance."""
-        c, s = np.cos(angle), np.sin(angle)
-        distance = self.y * c - self.x * s
-        first = float(np.floor(distance.min()))
-        place = np.rint(distance - first).astype(np.intp)
-        return np.asarray(np.bincount(place, self.gy * c - self.gx * s), dtype=np.float64), first
+        if angle not in self.known:
+            c, s = np.cos(angle), np.sin(angle)
+            distance = (self.y * c)[:, None] - self.x * s
+            first = float(np.floor(distance.min()))
+            distance -= first
+            place = np.rint(distance, out=distance).astype(np.intp).ravel()
+            sums = np.bincount(place, (self.gy * c - self.gx * s).ravel())
+            self.known[angle] = np.asarray(sums, dtype=np.float64), first
+        return self.known[angle]
 
 
 def find_strip(
@@ -161,15 +167,10 @@ def _no_strip() -> InvalidValueError:
 
 
 def _prepare_lines(smooth: Array) -> _Lines:
-    gy, gx = np.gradient(smooth)
-    y, x = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
     # The border of the image is not an edge.
-    inner = np.zeros(smooth.shape, dtype=bool)
-    inner[3:-3, 3:-3] = True
-    take = inner.ravel()
-    parts = [np.asarray(v.ravel()[take], dtype=np.float64) for v in (gx, gy, x, y)]
+    gy, gx = (np.asarray(part)[3:-3, 3:-3] for part in np.gradient(smooth))
     height, width = smooth.shape
-    return _Lines(parts[0], parts[1], parts[2], parts[3], (width, height))
+    return _Lines(gx, gy, np.arange(3.0, width - 3), np.arange(3.0, height - 3), (width, height))
 
 
 def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[float, int, int]:
@@ -177,7 +178,7 @@ def _find_best_pair(rise: Array, fall: Array, low: int, high: int) -> tuple[floa
     best = (0.0, 0, 0)
     for width in range(low, min(high, len(rise) - 1)):
         pair = np.minimum(rise[:-width], fall[width:])
-        first = int(np.argmax(pair))
+        first = int(pair.argmax())
         if pair[first] > best[0]:
             best = (float(pair[first]), first, first + width)
     strength, first, last = best
@@ -219,11 +220,12 @@ def _choose_strip(smooth: Array, length_px: float | None) -> tuple[bool, Strip]:
     fitting: list[tuple[bool, Strip]] = []
     first_seen: set[bool] = set()
     most = 0.0
+    lines = _prepare_lines(smooth)
     for is_dark, angle, point in _search_lines(smooth):
         is_first = is_dark not in first_seen
         first_seen.add(is_dark)
         signed = -smooth if is_dark else smooth
-        strength, *line = _find_pair_near(_prepare_lines(signed), angle, point)
+        strength, *line = _find_pair_near(lines, angle, point, is_dark)
         strength *= DARK_PART if is_dark else 1.0
         most = max(most, strength)
         if strength <= 0.0 or not (is_first or strength > STRENGTH_MIN * most):
@@ -314,15 +316,15 @@ def _search_lines(smooth: Array) -> list[tuple[bool, float, Array]]:
 
 
 def _find_pair_near(
-    lines: _Lines, nominal: float, point: Array
+    lines: _Lines, nominal: float, point: Array, is_dark: bool
 ) -> tuple[float, float, float, float]:
-    """Find strength, direction, distance from the origin and half width of the bright strip around a point."""
+    """Find strength, direction, distance from the origin and half width of the strip of this kind around a point."""
     reach = int(WIDTH_MAX * min(lines.size))
     best, found = 0.0, (0.0, nominal, 0.0, 0.0)
     for angle in nominal + FINE_RAD:
         sums, first = lines.across(float(angle))
         here = round(float(point[1] * np.cos(angle) - point[0] * np.sin(angle)) - first)
-        wide = _widen(sums)
+        wide = -_widen(sums) if is_dark else _widen(sums)
         left, right = max(here - reach, 0), min(here + reach, len(wide))
         if not left < here < right:
             continue
@@ -357,7 +359,8 @@ def _follow_clicks(smooth: Array, base: Array, tip: Array) -> tuple[bool, Strip]
     point = np.mean(points, axis=0) if points else 0.5 * (base + tip)
     if len(points) == 1:
         point = points[0] + inwards[0 if seen[0] else 1]
-    bright, dark = (_find_pair_near(_prepare_lines(s), nominal, point) for s in (smooth, -smooth))
+    lines = _prepare_lines(smooth)
+    bright, dark = (_find_pair_near(lines, nominal, point, kind) for kind in (False, True))
     is_dark = DARK_PART * dark[0] > bright[0]
     strength, angle, offset, half = dark if is_dark else bright
     if strength <= 0.0:

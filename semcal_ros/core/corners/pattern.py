@@ -24,7 +24,7 @@ fit names the pattern.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Literal, cast
 
 import numpy as np
@@ -222,6 +222,7 @@ def describe_odds(odds: float) -> str:
     return f"{odds:.0f} to one" if odds >= 10.0 else f"{odds:.2g} to one"
 
 
+@cache
 def _harmonics() -> tuple[Array, Array]:
     """Return the orders (h, k) of one of each pair of opposite coefficients."""
     orders = np.arange(-HARMONIC_ORDERS, HARMONIC_ORDERS + 1)
@@ -352,6 +353,8 @@ def find_motif(cell: UnitCell) -> tuple[float, float]:
     )
 
 
+# Enough for all centres that are tried.
+@lru_cache(maxsize=1024)
 def _move(u: float, v: float) -> NDArray[np.complex128]:
     """Factors on the coefficients that move the lattice point by (u, v) cells."""
     h, k = _harmonics()

@@ -32,6 +32,7 @@ from semcal_ros.applications.reconstruction.ball import jackknife_sigma, split_n
 from semcal_ros.core.errors import InvalidValueError, StructureError
 from semcal_ros.synthetic import Detector
 from semcal_ros.synthetic.specimens.ball import Turning, ball_microscope, ball_plan, draw_ball_plan
+from tests.helpers.made_once import made_once
 
 # The same pixel size as 2048 px at 9000x, in a smaller image.
 SMALL = replace(ball_microscope(width=512, height=192), name="small")
@@ -64,8 +65,11 @@ def plan():
 
 @pytest.fixture(scope="module")
 def structure(plan):
-    keyframes = followed(plan, TrackerSettings(spacing_px=8.0))
-    return reconstruct(keyframes, plan.microscope.timing)
+    def make():
+        keyframes = followed(plan, TrackerSettings(spacing_px=8.0))
+        return reconstruct(keyframes, plan.microscope.timing)
+
+    return made_once("structure-of-a-ball", make)
 
 
 @pytest.mark.slow

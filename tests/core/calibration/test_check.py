@@ -31,6 +31,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import SimulatedStage, stage_views
+from tests.helpers.made_once import made_once
 
 SEM = preset("jsm820")
 STAGE = SimulatedStage(
@@ -63,12 +64,14 @@ def changed(**by: float) -> Camera:
 
 @pytest.fixture(scope="module")
 def calibrated() -> CalibrationResult:
-    views = simulated(SEM.camera_at, VISITS, 1)
-    return calibrate_views(
-        views,
-        image_size=SEM.image_size,
-        display_width_m=SEM.display_width_m,
-        options=CalibrationOptions(axis=AXIS),
+    return made_once(
+        "calibrated-at-visits",
+        lambda: calibrate_views(
+            simulated(SEM.camera_at, VISITS, 1),
+            image_size=SEM.image_size,
+            display_width_m=SEM.display_width_m,
+            options=CalibrationOptions(axis=AXIS),
+        ),
     )
 
 

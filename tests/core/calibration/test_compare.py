@@ -27,6 +27,7 @@ from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import InvalidValueError
 from tests.core.calibration.test_check import AXIS, SEM, simulated
+from tests.helpers.made_once import made_once
 
 MAGNIFICATIONS = (300.0, 1000.0, 3000.0)
 
@@ -43,7 +44,7 @@ def calibrated(seed: int) -> CalibrationModel:
 
 @pytest.fixture(scope="module")
 def model() -> CalibrationModel:
-    return calibrated(1)
+    return made_once("calibrated-to-compare", lambda: calibrated(1))
 
 
 def changed(

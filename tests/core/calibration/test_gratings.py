@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -45,6 +46,7 @@ def pixel_m(magnification: float) -> float:
     return DISPLAY_WIDTH_M / (magnification * SCOPE.width)
 
 
+@cache
 def view(magnification: float, turn: float) -> FoundView:
     rng = np.random.default_rng(int(100.0 * turn))
     picture = draw_picture(SCOPE, pixel_m(magnification), PITCH_M, turn, rng)

@@ -37,7 +37,7 @@ JSM = preset("jsm820")
 
 def _calibrate(display_width_m, views=None, **options):
     return calibrate_views(
-        views or seen_views("jsm820", (1000.0,)),
+        views or seen_views("jsm820", (1000.0,), views=3),
         image_size=JSM.image_size,
         display_width_m=display_width_m,
         options=CalibrationOptions(**options),

@@ -32,7 +32,7 @@ from semcal_ros.core.calibration.paper.pda import (
 from semcal_ros.core.camera.calibration_model import FUNCTION_NAMES
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.synthetic import CALIBRATION_MAGNIFICATIONS
-from tests.helpers.calibrations import CALIBRATED, calibrated
+from tests.helpers.calibrations import CALIBRATED, CALIBRATED_EVENLY, calibrated
 
 PAPER = np.array(CALIBRATION_MAGNIFICATIONS)
 EVEN = np.arange(100.0, 4101.0, 100.0)
@@ -124,7 +124,8 @@ def test_too_few_magnifications_and_hopeless_steps_are_refused():
 
 @pytest.mark.slow
 def test_a_chosen_step_is_that_of_the_calibration():
-    result = calibrated("jsm820", CalibrationOptions("pda", MethodOptions(pda_step="auto")))
+    options = CalibrationOptions("pda", MethodOptions(pda_step="auto"))
+    result = calibrated("jsm820", options, CALIBRATED_EVENLY, 3)
     statistics = result.model.statistics
     steps, step = statistics["fit"]["steps"], statistics["fit"]["step"]
     (chosen,) = (row for row in steps if row["step"] == step)

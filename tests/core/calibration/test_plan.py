@@ -28,6 +28,7 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.records import Provenance
 from semcal_ros.core.errors import InvalidValueError
 from tests.core.calibration.test_check import AXIS, SEM, simulated
+from tests.helpers.made_once import made_once
 
 SQUARES_M = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 
@@ -35,11 +36,17 @@ SQUARES_M = (25e-6, 10e-6, 5e-6, 2e-6, 1e-6)
 @pytest.fixture(scope="module")
 def poor() -> CalibrationModel:
     """Calibrated at the ends and in the middle only."""
-    views = simulated(SEM.camera_at, (100.0, 1000.0, 10000.0), 1)
-    options = CalibrationOptions(axis=AXIS)
-    return calibrate_views(
-        views, image_size=SEM.image_size, display_width_m=SEM.display_width_m, options=options
-    ).model
+    return made_once(
+        "calibrated-poorly",
+        lambda: (
+            calibrate_views(
+                simulated(SEM.camera_at, (100.0, 1000.0, 10000.0), 1),
+                image_size=SEM.image_size,
+                display_width_m=SEM.display_width_m,
+                options=CalibrationOptions(axis=AXIS),
+            ).model
+        ),
+    )
 
 
 def plan(model: CalibrationModel, target: float, most_visits: int) -> ViewPlan:

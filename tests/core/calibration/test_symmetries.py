@@ -27,6 +27,7 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import grid_views
+from tests.helpers.made_once import made_once
 
 JSM = preset("jsm820")
 MAGNIFICATIONS = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
@@ -50,7 +51,7 @@ def _calibrate(
 
 @pytest.fixture(scope="module")
 def model(views: list[GridView]) -> CalibrationModel:
-    return _calibrate(views)
+    return made_once("calibrated-for-symmetries", lambda: _calibrate(views))
 
 
 def _largest_sigmas(

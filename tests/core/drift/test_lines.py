@@ -36,8 +36,8 @@ ACROSS = np.array([-np.sin(ANGLE), np.cos(ANGLE)])
 
 
 def scratched(count: int, seed: int = 101) -> tuple[list[AnyImage], Array]:
-    frames, drift, _ = draw(KINDS["scratches"], seed)
-    return frames[:count], drift[:count]
+    frames, drift, _ = draw(KINDS["scratches"], seed, count)
+    return frames, drift[:count]
 
 
 @pytest.fixture(scope="module")

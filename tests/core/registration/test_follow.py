@@ -28,11 +28,11 @@ from semcal_ros.core.registration.register import prepare_reference, register
 
 
 def test_a_tool_that_was_there_from_the_start_is_left_out_where_the_specimen_is_known() -> None:
-    frames, drift, _ = draw(KINDS["tool over sparse from the start"], 101)
+    frames, drift, _ = draw(KINDS["tool over sparse from the start"], 101, 10)
     settings = DriftSettings(registration=RegistrationSettings(follow=(0.6, 0.0, 1.0, 1.0)))
     followed, plain = DriftTracker(settings), DriftTracker()
     accepted = []
-    for k, frame in enumerate(frames[:10]):
+    for k, frame in enumerate(frames):
         update = followed.update(frame, float(k))
         accepted.append(plain.update(frame, float(k)).accepted)
         assert update.accepted
@@ -46,7 +46,7 @@ def test_a_tool_that_was_there_from_the_start_is_left_out_where_the_specimen_is_
 
 @pytest.mark.long
 def test_a_part_without_structure_is_refused_rather_than_guessed() -> None:
-    frames, _, _ = draw(KINDS["tool over gold from the start"], 101)
+    frames, _, _ = draw(KINDS["tool over gold from the start"], 101, 9)
     blank = frames[0].copy()
     moved = frames[8].copy()
     for picture in (blank, moved):
@@ -66,7 +66,7 @@ def test_a_part_that_is_no_rectangle_of_the_picture_is_an_error(
 
 
 def test_a_tool_does_not_choose_the_period_of_a_lattice() -> None:
-    frames, drift, _ = draw(KINDS["tool over a lattice"], 100)
+    frames, drift, _ = draw(KINDS["tool over a lattice"], 100, 21)
     reference = prepare_reference(frames[0])
     accepted = 0
     for k in (3, 6, 10, 14, 20):
@@ -79,7 +79,7 @@ def test_a_tool_does_not_choose_the_period_of_a_lattice() -> None:
 
 
 def test_a_part_of_a_lattice_to_follow_is_refused() -> None:
-    frames, drift, _ = draw(KINDS["lattice"], 100)
+    frames, drift, _ = draw(KINDS["lattice"], 100, 4)
     settings = RegistrationSettings(follow=(0.6, 0.0, 1.0, 1.0))
     found = register(
         prepare_reference(frames[0], settings=settings),

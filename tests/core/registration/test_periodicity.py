@@ -102,7 +102,7 @@ def test_where_a_lattice_is_seen(rough: float) -> None:
 @pytest.mark.parametrize("seed", [100, 101, 102])
 def test_a_few_particles_beside_a_tool_are_no_lattice(seed: int) -> None:
     """Some of them lie a period apart by chance: in a quarter of the picture, and not in most of it."""
-    frames, _, _ = draw(KINDS["tool over sparse"], seed)
+    frames, _, _ = draw(KINDS["tool over sparse"], seed, 16)
     by_chance = prepare_reference(frames[15])
     assert len(find_periods(by_chance.coarse.pyramid.centred(1), by_chance.noise_variance)) > 0
     assert len(by_chance.periods) == 0
