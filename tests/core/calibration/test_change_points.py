@@ -114,6 +114,8 @@ def test_a_function_with_a_jump():
     )
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_scale_that_bends_between_few_magnifications_is_not_suspected():
     def bending(g):
         camera = MICROSCOPE.camera_at(g)

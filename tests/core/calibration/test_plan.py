@@ -82,6 +82,8 @@ def test_the_plan_predicts_what_its_views_bring(poor: CalibrationModel) -> None:
     assert worst(after) < 0.95 * min(others)
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_the_plan_allows_for_what_may_change_until_then(poor: CalibrationModel) -> None:
     """As `semcal update` does, whose prior of the ageing is the same."""
     ageing = 5e-3
