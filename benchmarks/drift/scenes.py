@@ -486,6 +486,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         draw_figure("tool over gold", 100, (0, 9, 18, 29), chosen.figure)
         return 0
     names = [n.strip() for n in chosen.only.split(",") if n.strip()] or list(KINDS)
+    if unknown := [name for name in names if name not in KINDS]:
+        parser.error(f"--only {', '.join(unknown)}; expected some of: {', '.join(KINDS)}")
     if chosen.time:
         show_times(names, 1 if chosen.quick else chosen.seeds)
         return 0
