@@ -299,11 +299,15 @@ def test_a_recording_that_is_played_too_fast(
             fast = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=100.0)
             assert peer.set_parameter("bag_player", "rate", fast).successful
             assert player.wait() == 0
-        state = watch.wait_fresh(node)
+        # A busy computer comes to the last of them some time after the player has ended.
+        for _ in range(10):
+            state = watch.wait_fresh(node)
+            if int(state["received"]) + int(state["dropped"]) == len(magnifications):
+                break
+        assert int(state["received"]) + int(state["dropped"]) == len(magnifications), state
         assert int(state["dropped"]) > 0
         assert state["rejected"] == "0"
         peer.wait_for(lambda: len(images) == int(state["published"]), "what was published")
-        assert int(state["received"]) + int(state["dropped"]) == len(magnifications), state
     right = RECTIFIER.right(pictures[-1], magnifications[-1], "lanczos4")
     # The degree of a map's polynomials depends on those before: hundredths of a grey level, rounded.
     assert np.abs(pixels(images[-1]) - right).max() <= 1
