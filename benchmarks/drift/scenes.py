@@ -487,7 +487,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     names = [n.strip() for n in chosen.only.split(",") if n.strip()] or list(KINDS)
     if unknown := [name for name in names if name not in KINDS]:
-        parser.error(f"--only {', '.join(unknown)}; expected some of: {', '.join(KINDS)}")
+        parser.error(f"--only {'; '.join(unknown)}; expected some of: {'; '.join(KINDS)}")
     if chosen.time:
         show_times(names, 1 if chosen.quick else chosen.seeds)
         return 0

@@ -36,7 +36,6 @@ TOLERANCE = 0.05
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)  # eighteen commands, some of them calibrations
 @pytest.mark.long
 def test_the_first_calibration_prints_what_the_page_shows(tmp_path: Path) -> None:
     assert run_page(DOC / "tutorials" / "first_calibration.md", tmp_path, TOLERANCE) == 11
@@ -63,7 +62,6 @@ NOT_RUN = {
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 @pytest.mark.long
 def test_the_page_of_all_commands_prints_what_it_shows(tmp_path: Path) -> None:
     page = DOC / "cli.md"

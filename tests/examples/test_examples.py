@@ -35,7 +35,7 @@ from tests.helpers.listings import follow_notebook, listings, run_page
 from tests.helpers.ros_domain import claim_domain
 
 # They make their recordings and calibrations themselves.
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.slow
 
 # As in the tutorials: another processor rounds differently, and a fit amplifies that.
 TOLERANCE = 0.05

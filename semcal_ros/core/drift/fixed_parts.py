@@ -86,15 +86,10 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
     # What lay at x before is seen at x + shift now: look at both of them from each place.
     moved = np.full((2, height, width), np.inf, dtype=np.float32)
     for k, (image, other, sign) in enumerate(((second, first, -1.0), (first, second, 1.0))):
-        x, y = (sign * shift_px).tolist()
-        warp = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
-        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        there = cv2.warpAffine(
-            other, warp, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
-        )
+        there = _look_beside(other, sign * shift_px)
         covered = cv2.warpAffine(
             np.ones_like(other),
-            warp,
+            _shift_matrix(sign * shift_px),
             (width, height),
             flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
         )
@@ -126,13 +121,30 @@ def _has_moved(first: Image, second: Image, shift_px: Array, rest: Mask) -> bool
     They are smoothed: interpolation takes away less of what noise is left then, and does not make the moved one agree.
     """
     sigma = GRADIENTS_SMOOTHED_PX
-    one, two = (cv2.GaussianBlur(image, (0, 0), sigma) for image in (first, second))
-    x, y = (-shift_px).tolist()
-    warp = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    there = cv2.warpAffine(one, warp, one.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    one, two = (
+        np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
+        for image in (first, second)
+    )
+    there = _look_beside(one, -shift_px)
     squares = [np.sum((two - other)[rest] ** 2, dtype=np.float64) for other in (there, one)]
     return bool(squares[0] < squares[1])
+
+
+def _shift_matrix(shift_px: Array) -> Array:
+    x, y = shift_px.tolist()
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+
+
+def _look_beside(image: Image, shift_px: Array) -> Image:
+    """What an image shows ``shift_px`` (2,) beside each pixel."""
+    there = cv2.warpAffine(
+        image,
+        _shift_matrix(shift_px),
+        image.shape[::-1],
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(there, dtype=np.float32)
 
 
 def share_of_gradients(image: AnyImage, part: Mask) -> float:

@@ -34,7 +34,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from semcal_ros.core.arrays import Array, invert_scaled
-from semcal_ros.core.drift.operations import Measure, Operation
+from semcal_ros.core.drift.operations import Measure, MeasureOutcome, Operation
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import (
@@ -96,14 +96,26 @@ def _run_forward(
         yield step
 
 
-def replay(start: DriftState, events: Sequence[Event], process_noise: ProcessNoise) -> DriftState:
-    """The state after all events are applied again."""
+def _apply(
+    start: DriftState, events: Sequence[Event], process_noise: ProcessNoise
+) -> Iterator[tuple[DriftState, MeasureOutcome | None]]:
+    """The state after each event, with what came of a measurement."""
     state = start
     for event in events:
+        outcome = None
         if isinstance(event, Operation):
             state = event(state, process_noise)
         elif isinstance(event, Measure):
-            state = event(state, process_noise).state
+            outcome = event(state, process_noise)
+            state = outcome.state
+        yield state, outcome
+
+
+def replay(start: DriftState, events: Sequence[Event], process_noise: ProcessNoise) -> DriftState:
+    """The state after all events are applied again."""
+    state = start
+    for after, _ in _apply(start, events, process_noise):
+        state = after
     return state
 
 
@@ -215,16 +227,12 @@ def _maximise_likelihood(
         return replace(near, psd=psd, time_constant_s=time_constant_s)
 
     def cost(log_psd: float) -> float:
-        process_noise, state = with_density(log_psd), start
-        costs: list[float] = []
-        for event in events:
-            if isinstance(event, Operation):
-                state = event(state, process_noise)
-            elif isinstance(event, Measure):
-                outcome = event(state, process_noise)
-                state = outcome.state
-                size = float(np.linalg.slogdet(outcome.innovation_covariance)[1])
-                costs.append(min(outcome.nis + outcome.shear_nis, MEASUREMENT_COST_MAX) + size)
+        costs = [
+            min(outcome.nis + outcome.shear_nis, MEASUREMENT_COST_MAX)
+            + float(np.linalg.slogdet(outcome.innovation_covariance)[1])
+            for _, outcome in _apply(start, events, with_density(log_psd))
+            if outcome is not None
+        ]
         return sum(costs[MEASUREMENTS_UNCOUNTED:], start=0.0)
 
     grid = np.linspace(*DENSITY_LOG_RANGE, DENSITY_GRID)
