@@ -319,10 +319,10 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "gold": Kind(gold),
-    "gold, 2 electrons": Kind(gold, electrons=8.0),
-    "gold, charging": Kind(gold, charging),
-    "gold, stage move": Kind(gold, jump_px=60.0),
-    "gold, fast": Kind(gold, step_px=3.0),
+    "gold at 2 electrons": Kind(gold, electrons=8.0),
+    "charging gold": Kind(gold, charging),
+    "gold and a stage move": Kind(gold, jump_px=60.0),
+    "fast gold": Kind(gold, step_px=3.0),
     "sparse": Kind(sparse),
     "fine": Kind(fine),
     "fractal": Kind(fractal),
@@ -350,7 +350,7 @@ KINDS: dict[str, Kind] = {
     "scratches": Kind(scratches, determined=False),
     "tool over scratches": Kind(scratches, tool, determined=False),
     "perfect lattice": Kind(lambda rng: lattice(rng, 0), determined=False),
-    "perfect lattice, jump": Kind(lambda rng: lattice(rng, 0), jump_px=9.0, determined=False),
+    "perfect lattice and a jump": Kind(lambda rng: lattice(rng, 0), jump_px=9.0, determined=False),
     "noise": Kind(flat, determined=False),
 }
 

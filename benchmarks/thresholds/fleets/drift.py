@@ -26,7 +26,7 @@ from semcal_ros.core.drift.tracker import DriftTracker
 
 SCENES = (
     "gold",
-    "gold, stage move",
+    "gold and a stage move",
     "sparse",
     "lattice",
     "tool over gold",

@@ -43,8 +43,8 @@ PAIRS = {
 }
 # Of a scene: numbers of the reference and of the images after it, and the 1-sigma of their predictions.
 SCENES = {
-    "gold, 2 electrons": (0, (2, 4, 6, 8), 0.0),
-    "gold, charging": (0, (2, 4, 6, 8), 0.0),
+    "gold at 2 electrons": (0, (2, 4, 6, 8), 0.0),
+    "charging gold": (0, (2, 4, 6, 8), 0.0),
     "sparse": (0, (2, 4, 6, 8), 0.0),
     "clouds": (0, (2, 4, 6, 8), 1.0),
     "lattice": (0, (2, 4), 1.0),
