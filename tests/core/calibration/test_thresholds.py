@@ -33,8 +33,7 @@ from semcal_ros.core.calibration.judgement.check import CHANGES
     [
         (stats.chi2.sf(estimator.HUBER_SIGMAS**2, 2), 90),
         (stats.norm.sf(estimator.FIELD_GAIN_SIGMAS), 160),
-        (stats.norm.sf(judgement.JUMP_SIGMAS), 290),
-        (14.0 * stats.norm.sf(judgement.JUMP_SIGMAS), 20),
+        (judgement.JUMP_FALSE_ALARMS, 100),
         (2.0 * stats.norm.sf(judgement.TILT_SIGMAS), 1.7e6),
         (2.0 * stats.norm.sf(judgement.SURPRISING_SIGMAS), 16_000),
         (10.0 * 2.0 * stats.norm.sf(judgement.DIFFERENT_SIGMAS), 100),

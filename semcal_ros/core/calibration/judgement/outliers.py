@@ -28,7 +28,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtri, stdtrit
 
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
@@ -43,7 +43,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     DETERMINED_MIN,
     HEIGHT_SIGMAS,
     HEIGHT_SPREAD_MIN_M,
-    JUMP_SIGMAS,
+    JUMP_FALSE_ALARMS,
     MISFIT_RATIO,
     SHAPE_SPREAD_MIN,
     TILT_SIGMAS,
@@ -77,7 +77,8 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     """Find the jump that would improve an adjustment most, or None if none is significant.
 
     ``problem`` and ``result`` are the adjustment at its optimum, with coefficients beyond those that were chosen: what
-    a smooth function may do besides is no jump. Breakpoints that it already has are left out.
+    a smooth function may do besides is no jump. Breakpoints that it already has are left out. A recording without a
+    jump shows one with the chance `JUMP_FALSE_ALARMS`, shared among its places by Bonferroni's inequality.
     """
     if problem.effects is not None:
         # A jump that is not in the model makes the visits look as if they did not come back.
@@ -99,12 +100,13 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
     variance = max(variance_factor(problem, result), 1.0)
     # Scatter of few visits is known badly: by Student's t, the same chance needs a larger gain.
     freedom = max(determined - 1.0, 1.0)
-    chance = ndtr(-JUMP_SIGMAS)
-    by_corners, by_visits = (0.5 * x**2 for x in (JUMP_SIGMAS, stdtrit(freedom, chance)))
+    places = [
+        k for k in range(1, len(g)) if not any(g[k - 1] < b <= g[k] for b in setup.breakpoints)
+    ]
+    chance = 0.5 * JUMP_FALSE_ALARMS / max(len(places), 1)
+    by_corners, by_visits = (0.5 * x**2 for x in (ndtri(chance), stdtrit(freedom, chance)))
     best, best_excess = None, 1.0
-    for k in range(1, len(g)):
-        if any(g[k - 1] < b <= g[k] for b in setup.breakpoints):
-            continue
+    for k in places:
         column = np.where(np.arange(len(g)) >= k, nominal, 0.0)
         pull = result.information[:, :, 0] * column[:, None]
         cross = np.einsum("mpk,mp->k", problem.designs, pull)

@@ -127,10 +127,10 @@ NEXT_SIGMA_PX = TABLE.stated(
 
 # Outliers, in outliers.py
 
-JUMP_SIGMAS = TABLE.derived(
-    "JUMP_SIGMAS", 2.7, "sigma",
-    "Of a jump: at one place, noise exceeds it once in 290 (normal, one side), so that one recording in twenty is "
-    "suspected if some fourteen of its places are independent.",
+JUMP_FALSE_ALARMS = TABLE.defined(
+    "JUMP_FALSE_ALARMS", 0.01, "chance",
+    "With which a recording without a jump of the scale is said to have one, at any of its places and in either "
+    "direction: once in 100 recordings.",
 )
 TILT_SIGMAS = TABLE.derived(
     "TILT_SIGMAS", 5.0, "sigma",
