@@ -93,6 +93,7 @@ from semcal_ros.core.registration.tiles import (
     PyramidLevel,
     TileSums,
     TileWindow,
+    residuals_at_gradients,
     tile_sums,
     tile_window,
 )
@@ -344,7 +345,9 @@ class _Comparison:
     @cached_property
     def expected_variances(self) -> Array:
         """(tiles, 2, 2) covariance of each tile's score as the residuals of its pixels tell it."""
-        return _expect_variances(self)
+        tiles, counts = self.tiles, self.level.pixel_counts[self.window.rows, self.window.cols]
+        left = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
+        return _expect_variances(self, left / counts)
 
     def weighs_alike(self, window: TileWindow, weights: Array | None) -> bool:
         """Whether the tiles of a window are those of this comparison, with the same weights."""
@@ -690,17 +693,20 @@ def _expect_spread(comparison: _Comparison, powers: Array) -> Array:
     A tile has some hundred pixels, and only two scores: of a few tiles it is the better estimate. It does not see what
     moves a tile as a whole.
     """
-    both = np.einsum("tp,tq,tij->piqj", powers, powers, comparison.expected_variances)
+    gain = (comparison.geometry.ramps @ comparison.fit.gain).reshape(comparison.plain.energy.shape)
+    squares = residuals_at_gradients(comparison.level, comparison.window, comparison.plain, gain)
+    variances = _expect_variances(comparison, squares)
+    both = np.einsum("tp,tq,tij->piqj", powers, powers, variances)
     return np.asarray(both.reshape(2 * powers.shape[1], -1))
 
 
-def _expect_variances(comparison: _Comparison) -> Array:
-    tiles, level, window = comparison.tiles, comparison.level, comparison.window
-    residual = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
+def _expect_variances(comparison: _Comparison, squares: Array) -> Array:
+    """(tiles, 2, 2) covariance of each tile's score, from the mean squares (rows, cols) that the fit leaves in it."""
+    level, window = comparison.level, comparison.window
     counts = level.pixel_counts[window.rows, window.cols]
     weights = comparison.geometry.normal_matrices[:, 3, 3] / counts.ravel()
     products = level.noise_products[window.rows, window.cols].reshape(-1, 2, 2)
-    variances = weights**2 * np.maximum(residual / counts, 0.0).ravel()
+    variances = weights**2 * np.maximum(squares, 0.0).ravel()
     return np.asarray(variances[:, None, None] * products)
 
 

@@ -32,7 +32,6 @@ from semcal_ros.core.registration.thresholds import (
     DEVIATIONS_MIN,
     OVERLAP_MIN,
     REPEATING_SHARE_MIN,
-    SATURATED_MAX,
     SIGMA_PX_MAX,
 )
 from semcal_ros.core.registration.tiles import PyramidLevel
@@ -54,8 +53,6 @@ class RegistrationSettings:
         Largest acceptable 1-sigma of the shift in its worst direction.
     min_correlation
         Least correlation of the two images after their noise has been accounted for.
-    max_saturated
-        Largest fraction of pixels at either end of the grey scale.
     min_competing_height
         Correlation peaks higher than this fraction of the highest compete with it.
     min_deviations
@@ -71,7 +68,6 @@ class RegistrationSettings:
     min_overlap: float = OVERLAP_MIN
     max_sigma_px: float = SIGMA_PX_MAX
     min_correlation: float = CORRELATION_MIN
-    max_saturated: float = SATURATED_MAX
     min_competing_height: float = COMPETING_HEIGHT_MIN
     min_deviations: float = DEVIATIONS_MIN
     texture_region: Region | None = None

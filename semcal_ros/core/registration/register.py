@@ -79,7 +79,6 @@ from semcal_ros.core.registration.thresholds import (
     LEVEL_PX_MIN,
     PARTS_SIGNAL_MIN,
     PULL_PX_MAX,
-    SATURATION_SAMPLES,
     SIDE_PX_MIN,
     SIGNAL_MIN,
     SIGNAL_SHARE_MIN,
@@ -200,22 +199,14 @@ def _crop(image: ArrayLike, region: Region | None) -> tuple[AnyImage, Region]:
     return gray[top:bottom, left:right], region
 
 
-def _find_defect(gray: AnyImage, settings: RegistrationSettings) -> str:
+def _find_defect(gray: AnyImage) -> str:
     """Why an image alone cannot be registered, or an empty string."""
     if min(gray.shape) < SIDE_PX_MIN:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     if gray.dtype.kind == "f" and not np.isfinite(np.sum(gray, dtype=np.float64)):
         return "values that are not finite"
-    stride = max(1, min(gray.shape) // SATURATION_SAMPLES)
-    some = np.ascontiguousarray(gray[::stride, ::stride])
-    lowest, highest = some.min(), some.max()
-    if lowest == highest:
-        return f"blank (all pixels at {highest:g})"
-    for end in (lowest, highest):
-        share = float(np.count_nonzero(some == end)) / some.size
-        if share > settings.max_saturated:
-            return f"saturated ({100.0 * share:.0f} % of the pixels at {end:g})"
-    return ""
+    lowest, highest = gray.min(), gray.max()
+    return f"blank (all pixels at {highest:g})" if lowest == highest else ""
 
 
 def prepare_reference(
@@ -254,7 +245,7 @@ def prepare_reference(
     gray, inside = _crop(image, region)
     pyramid = Pyramid(gray)
     coarse = CoarseReference(pyramid, limits.min_overlap)
-    defect = _find_defect(gray, limits)
+    defect = _find_defect(gray)
     if defect:
         return Reference(inside, coarse, (), 0.0, defect, limits)
     before = None if raw is None else raw[inside[1] : inside[3], inside[0] : inside[2]]
@@ -461,7 +452,7 @@ def _register_across(
 ) -> Registration:
     """Measure the shift across the lines of a reference that shows nothing else, at the predicted place along them."""
     gray, inside = _crop(image, image_region)
-    defect = _find_defect(gray, reference.settings)
+    defect = _find_defect(gray)
     if defect:
         return _reject(MatchFailure.UNUSABLE_IMAGE, f"image: {defect}")
     origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)
@@ -515,7 +506,7 @@ def _register(
     gray, inside = _crop(image, image_region)
     if reference.defect:
         return _reject(MatchFailure.UNUSABLE_REFERENCE, f"reference: {reference.defect}")
-    defect = _find_defect(gray, reference.settings)
+    defect = _find_defect(gray)
     if defect:
         return _reject(MatchFailure.UNUSABLE_IMAGE, f"image: {defect}")
     origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)

@@ -42,10 +42,6 @@ CORRELATION_MIN = TABLE.stated(
     "CORRELATION_MIN", 0.6, "correlation",
     "Free of noise; below, two thirds of the variance of either image (1 - 0.6^2) are not in the other one.",
 )
-SATURATED_MAX = TABLE.stated(
-    "SATURATED_MAX", 0.5, "of the pixels",
-    "At either end of the grey scale, where they show nothing.",
-)
 COMPETING_HEIGHT_MIN = TABLE.stated(
     "COMPETING_HEIGHT_MIN", 0.7, "of the highest peak",
     "Of peaks that are compared by how well they explain the image; lower ones are structure that resembles itself "
@@ -98,10 +94,6 @@ LEVEL_PX_MIN = TABLE.derived(
     "LEVEL_PX_MIN", 160, "px",
     "Of a reduced image: it leaves 24 tiles of the least side, 6 px, along each side between the margins of the "
     "filters. Coarser levels would have fewer.",
-)
-SATURATION_SAMPLES = TABLE.cost(
-    "SATURATION_SAMPLES", 256, "px",
-    "Along a side, in which saturation is counted: they tell its share to 0.2 %.",
 )
 SIGNAL_MIN = TABLE.derived(
     "SIGNAL_MIN", 0.06, "of the variance of the noise",

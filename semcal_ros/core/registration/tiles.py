@@ -167,15 +167,18 @@ class TileSums:
     hessian
         (2, 2) Gauss-Newton Hessian of the shift: the image's own gradients times those of the
         reference, scaled to all tiles; noise does not contribute to it on average.
+    pixels
+        (rows, cols, n) the image's pixels, of which the sums are.
     """
 
     cross: Array
     energy: Array
     hessian: Array
+    pixels: Image = field(repr=False)
 
     def weighted(self, weights: Array) -> TileSums:
         """The sums with weights (rows, cols) of the tiles, which the Hessian has already."""
-        return TileSums(self.cross * weights[..., None], self.energy * weights, self.hessian)
+        return replace(self, cross=self.cross * weights[..., None], energy=self.energy * weights)
 
 
 @dataclass(frozen=True)
@@ -389,7 +392,27 @@ def tile_sums(
     cross[..., :3] = (level.products[rows, cols] @ tiles[..., None])[..., 0]
     cross[..., 3] = tiles @ np.ones(tiles.shape[2], dtype=np.float32)
     energy = np.einsum("crn,crn->rc", sampled, sampled).astype(np.float64)
-    return TileSums(cross, energy, hessian)
+    return TileSums(cross, energy, hessian, tiles)
+
+
+def residuals_at_gradients(
+    level: PyramidLevel, window: TileWindow, sums: TileSums, gain: Array
+) -> Array:
+    """(rows, cols) squares of what ``gain`` (rows, cols) and each tile's offset leave of its pixels, as a mean with the
+    squares of the reference's gradients for weights.
+
+    Of a bright particle on a dark ground, noise is where the gradients are: the mean of all pixels is some times less.
+    """
+    slopes, grey = np.split(level.products[window.rows, window.cols], [2], axis=2)
+    counts = level.pixel_counts[window.rows, window.cols]
+    sum_of_reference = level.normal_matrices[window.rows, window.cols, 2, 3]
+    offset = (sums.cross[..., 3] - gain * sum_of_reference) / counts
+    left = sums.pixels - gain[..., None] * grey[:, :, 0] - offset[..., None]
+    energies = np.einsum("rckn,rckn->rcn", slopes, slopes)
+    if level.dropped is not None:
+        energies[level.dropped[window.rows, window.cols]] = 0.0
+    weighted = np.einsum("rcn,rcn,rcn->rc", energies, left, left)
+    return np.asarray(weighted / np.maximum(energies.sum(axis=2, dtype=np.float64), 1e-30))
 
 
 def _common_hessian(level: PyramidLevel, window: TileWindow, sampled: Image, enough: int) -> Array:

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration import inverse_compositional
@@ -229,15 +230,39 @@ def _noise(seed: int) -> np.ndarray:
     return 100.0 + 10.0 * np.random.default_rng(seed).standard_normal((SIZE, SIZE))
 
 
-def test_refuses_blank_saturated_and_featureless() -> None:
+def test_refuses_blank_and_featureless() -> None:
     reference, image = _pair((0.0, 0.0), 4.0)
     _refused(register_pair(reference, np.zeros((SIZE, SIZE), np.uint8)), "image: blank")
     _refused(register_pair(np.full((SIZE, SIZE), 7, np.uint8), image), "reference: blank")
-    burnt = np.clip((image - 60.0) * 10.0, 0, 255).astype(np.uint8)
-    _refused(register_pair(reference, burnt), "image: saturated")
     _refused(register_pair(reference, np.full((SIZE, SIZE), np.nan, np.float32)), "not finite")
     _refused(register_pair(_noise(0), _noise(1)), "reference: featureless (noise only)")
     _refused(register_pair(reference, _noise(2)), "stands out")
+
+
+@pytest.mark.parametrize(
+    ("offset", "share_black", "share_white"), [(60.0, 0.06, 0.83), (130.0, 0.54, 0.24)]
+)
+def test_what_is_not_saturated_tells_the_shift(
+    offset: float, share_black: float, share_white: float
+) -> None:
+    """Pixels at an end of the grey scale show nothing, and their noise is hidden; the edges between them show it."""
+    shift = np.array([2.3, -1.4])
+    pair = [np.clip((p - offset) * 10.0, 0, 255).astype(np.uint8) for p in _pair(tuple(shift), 4.0)]
+    assert np.mean(pair[0] == 0) == pytest.approx(share_black, abs=0.02)
+    assert np.mean(pair[0] == 255) == pytest.approx(share_white, abs=0.02)
+    result = register_pair(*pair)
+    assert result.accepted, result.reason
+    # 3 sigmas of the two directions.
+    z = np.linalg.solve(np.linalg.cholesky(result.covariance), result.shift_px - shift)
+    assert float(z @ z) < stats.chi2.isf(0.0027, 2)
+    assert np.max(np.abs(result.shift_px - shift)) < 0.05
+
+
+def test_a_few_bright_pixels_on_black_are_not_blank() -> None:
+    """They are found in large images, too, wherever they lie."""
+    image = np.zeros((1024, 1024), np.uint8)
+    image[611, 333] = 200
+    assert not prepare_reference(image).defect.startswith("blank")
 
 
 def test_refuses_what_leaves_a_direction_open() -> None:

@@ -17,11 +17,21 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from benchmarks.drift.scenes import KINDS, draw
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.registration.noise_spectrum import passed_variance
 from semcal_ros.core.registration.register import prepare_reference, register
+from semcal_ros.core.registration.tiles import (
+    Pyramid,
+    make_level,
+    residuals_at_gradients,
+    tile_sums,
+    tile_window,
+)
 
 
 @pytest.mark.long
@@ -45,3 +55,70 @@ def test_few_particles_reach_the_bound_with_a_sigma_that_holds() -> None:
     # From the scatter of eight scores alone, the sigma would be 2.5 times the bound.
     ratio = np.array(sigmas) / np.array(bounds)
     assert float(np.mean(ratio)) < 2.2
+
+
+def _discs(places: np.ndarray, rng: np.random.Generator, electrons: float = 60.0) -> np.ndarray:
+    """(192, 192) image of discs on a ground that gives next to no electrons, with counted ones."""
+    y, x = np.mgrid[:192, :192].astype(float)
+    signal = np.zeros((192, 192))
+    for place in places:
+        # An edge of 1 px.
+        signal += 1.0 / (1.0 + np.exp((np.hypot(x - place[0], y - place[1]) - 2.0) / 0.5))
+    grey = rng.poisson(electrons * signal + 0.3) * (180.0 / electrons)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def test_bright_particles_on_black_are_followed_within_their_sigma() -> None:
+    """More than nine tenths of the picture are black, and all of the noise is where the particles are."""
+    scores = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        places, tracker = rng.uniform(10.0, 182.0, (6, 2)), DriftTracker()
+        velocity = rng.uniform(-0.7, 0.7, 2)
+        for k in range(12):
+            image = _discs(places + k * velocity, rng)
+            assert np.mean(image == 0) > 0.5
+            update = tracker.update(image, float(k))
+            if k and update.accepted:
+                sigma = np.sqrt(np.diag(update.covariance)[:2])
+                scores.append((update.drift_px - k * velocity) / sigma)
+    assert len(scores) >= 0.95 * 8 * 11
+    # The eight series have the noise of their first frames in common with themselves: 16 scores of their own, whose RMS
+    # is below 1.45 but once in 100 times.
+    assert 0.5 < float(np.sqrt(np.mean(np.square(scores)))) < 1.45
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_what_noise_does_where_the_gradients_are(everywhere: bool) -> None:
+    """Of the same variance in all pixels, the weighted mean is the plain one; of a bright particle it is its own."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:256, :256].astype(float)
+    inside = np.hypot(x - 127.0, y - 127.0) < 2.5
+    clean = cv2.GaussianBlur(np.where(inside, 200.0, 0.0).astype(np.float32), (0, 0), 1.0)
+    level = make_level(Pyramid(clean), 1, 1.0)
+    assert level is not None
+    window = tile_window(level, (256, 256), np.zeros(2))
+    assert window is not None
+    near = inside | (cv2.dilate(inside.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0)
+    found, plain = [], []
+    for _ in range(40):
+        noise = rng.normal(0.0, 10.0, clean.shape) * (1.0 if everywhere else near)
+        image = Pyramid(clean + noise.astype(np.float32))
+        sums = tile_sums(level, window, image.centred(1), np.zeros(2), np.zeros((2, 2)))
+        gain = np.ones(sums.energy.shape)
+        squares = residuals_at_gradients(level, window, sums, gain)
+        energy = np.einsum("rcii->rc", level.normal_matrices[window.rows, window.cols, :2, :2])
+        row, col = np.unravel_index(np.argmax(energy), energy.shape)
+        found.append(squares[row, col])
+        grey = level.products[window.rows, window.cols, 2]
+        left = sums.pixels - grey
+        plain.append(left[row, col].var())
+    expected = 100.0 * passed_variance(1.0)
+    # 40 tiles with some ten independent pixels at their gradients each.
+    if everywhere:
+        assert np.mean(found) == pytest.approx(expected, rel=0.2)
+        assert np.mean(plain) == pytest.approx(expected, rel=0.1)
+    else:
+        # At the edge of where the noise is, the smoothing takes some.
+        assert np.mean(found) == pytest.approx(0.85 * expected, rel=0.2)
+        assert np.mean(plain) < 0.7 * np.mean(found)

@@ -73,7 +73,6 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
     [
         (t.SIDE_PX_MIN - 2 * FINE.reach, 6 * 6, 0.0),
         ((t.LEVEL_PX_MIN - 2 * FINE.reach) // 6, 24, 0.0),
-        (0.5 / t.SATURATION_SAMPLES, 0.002, 1e-4),
         # Coefficients of the spectrum of a real image, for each ring.
         (t.TEXTURE_PX_MIN * (t.TEXTURE_PX_MIN // 2 + 1) / t.SPECTRUM_RINGS, 3.0, 0.0),
         (t.HALVES_PX_MAX / 300.0, 1e-3, 1e-12),
