@@ -287,6 +287,23 @@ def charging(frame: Frame, k: int, rng: Rng) -> Frame:
     )
 
 
+def hum(frame: Frame, k: int, rng: Rng) -> Frame:
+    """Of the mains, in step with the frames, over a tenth of the grey levels of gold."""
+    rows = 0.03 * np.sin(2 * np.pi * (np.arange(SIZE)[:, None] / 8.53 + rng.uniform()))
+    return Frame(frame.picture + rows, frame.shown)
+
+
+def own_lines(frame: Frame, k: int, rng: Rng) -> Frame:
+    """Charging that gives each line brightness of its own in each frame."""
+    rows = 0.1 * np.random.default_rng(1000 + k).normal(size=(SIZE, 1))
+    return Frame(np.clip(frame.picture + rows, 0.0, None), frame.shown)
+
+
+def columns(frame: Frame, k: int, rng: Rng) -> Frame:
+    """A converter for each column, of which none is like the other."""
+    return Frame(frame.picture * (1.0 + 0.05 * rng.normal(size=(1, SIZE))), frame.shown)
+
+
 def nothing(frame: Frame, k: int, rng: Rng) -> Frame:
     return frame
 
@@ -345,6 +362,10 @@ KINDS: dict[str, Kind] = {
     "pushed over sparse": Kind(sparse, pushed),
     "shadow": Kind(gold, shadow),
     "data bar": Kind(gold, data_bar),
+    "hum over gold": Kind(gold, hum),
+    "hum over fibres": Kind(fibres, hum),
+    "lines of their own": Kind(gold, own_lines),
+    "columns over ridges": Kind(ridges, columns),
     "spots and cross-hair": Kind(gold, spots),
     "tool over sparse from the start": Kind(sparse, tool_from_start, determined=False),
     "scratches": Kind(scratches, determined=False),

@@ -210,6 +210,10 @@ def track_recording(source: Source, options: DriftOptions) -> DriftTrack:
     path = follower.path(live=live)
     if path.turns:
         notes.append(_describe_similarity(path))
+    if len(path) and path[-1].stripes:
+        notes.append(
+            f"the frames have stripes: what their {path[-1].stripes} have in common was taken out"
+        )
     return DriftTrack(
         tuple(stamps_ns),
         path,

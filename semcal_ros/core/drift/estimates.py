@@ -31,6 +31,7 @@ from semcal_ros.core.drift.own_motion import OwnMotion
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.similarity import SimilarityPredictor, turn_drift
 from semcal_ros.core.drift.state import MOTION_SIZE, DriftState
+from semcal_ros.core.drift.stripes import Stripes
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.rectification.raw_positions import RasterDrift
 from semcal_ros.core.registration.agreement import MovingTiles
@@ -147,6 +148,8 @@ class DriftUpdate(DriftEstimate):
     fixed
         What stays in place while the specimen drifts, such as a data bar or a burnt spot of the detector, and was left
         out; in the same px. None where nothing was found.
+    stripes
+        In which directions the frame has brightness of its own lines or columns, which was taken out.
     of_scale
         (2, 2) the part of the covariance of the drift that is due to the scale of the camera, which changes metres and
         not pixels.
@@ -169,6 +172,7 @@ class DriftUpdate(DriftEstimate):
     moving: MovingTiles | None = field(default=None, kw_only=True)
     own_motion: OwnMotion | None = field(default=None, kw_only=True)
     fixed: MovingTiles | None = field(default=None, kw_only=True)
+    stripes: Stripes = field(default_factory=Stripes, kw_only=True)
     of_scale: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
 
     @property

@@ -78,7 +78,7 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
     """
     if before.shape != now.shape or np.hypot(*shift_px) < FIXED_MOVE_PX_MIN:
         return None
-    first, second = _to_levels(before), _to_levels(now)
+    first, second = to_levels(before), to_levels(now)
     height, width = first.shape
     if np.any(np.abs(shift_px) > 0.5 * np.array([width, height])):
         return None
@@ -153,7 +153,7 @@ def share_of_gradients(image: AnyImage, part: Mask) -> float:
     A shift is pulled to that of the part by as much of the difference. The image is smoothed against noise, which has
     gradients, too; those that are left are allowed for by a factor of two.
     """
-    smoothed = cv2.GaussianBlur(_to_levels(image), (0, 0), GRADIENTS_SMOOTHED_PX)
+    smoothed = cv2.GaussianBlur(to_levels(image), (0, 0), GRADIENTS_SMOOTHED_PX)
     squares = (
         cv2.Sobel(smoothed, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(smoothed, cv2.CV_32F, 0, 1) ** 2
     )
@@ -162,7 +162,8 @@ def share_of_gradients(image: AnyImage, part: Mask) -> float:
     return min(1.0, GRADIENTS_ALLOWED * inside / max(whole, 1e-30))
 
 
-def _to_levels(image: AnyImage) -> Image:
+def to_levels(image: AnyImage) -> Image:
+    """(h, w) grey levels of an image (h, w) or (h, w, 3), in single precision."""
     gray = image if image.ndim == 2 else image[..., 1]
     return np.asarray(gray, dtype=np.float32)
 

@@ -20,7 +20,7 @@ moved (:mod:`.fixed_parts`). Both are left out of a frame, and out of keyframes 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,9 +28,11 @@ from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.fixed_parts import (
     find_fixed_parts,
     share_of_gradients,
+    to_levels,
 )
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.stripes import Stripes, find_stripes, suspect_stripes
 from semcal_ros.core.drift.thresholds import (
     FIXED_EVERY_FRAMES_MAX,
     FIXED_FIRST,
@@ -38,6 +40,7 @@ from semcal_ros.core.drift.thresholds import (
     NEWLY_FIXED,
     OVERLAY_EVERY_FRAMES,
     OVERLAY_FIRST_FRAMES,
+    STRIPE_MOVE_PX_MAX,
 )
 
 
@@ -72,6 +75,11 @@ class StaticParts:
         The frame that the next one is compared with for that.
     comparisons
         Number of such comparisons.
+    stripes
+        Directions in which brightness does not move with the specimen.
+    anchor
+        The frame that later ones are compared with for that: stripes are seen once the specimen has moved by a part of
+        their period.
     """
 
     frames: int = 0
@@ -80,15 +88,26 @@ class StaticParts:
     fixed: Mask | None = None
     earlier: EarlierFrame | None = None
     comparisons: int = 0
+    stripes: Stripes = field(default_factory=Stripes)
+    anchor: EarlierFrame | None = None
 
     def remove_from(self, frame: ScanFrame) -> ScanFrame:
-        """The frame with the place of what does not show the specimen filled from around, as far as it is known."""
+        """The frame with the place of what does not show the specimen filled from around, as far as it is known, and
+        without stripes.
+        """
+        fixed = self._mask(frame.image)
+        if fixed is not None:
+            frame = replace(frame, image=remove_overlay(frame.image, fixed), fixed=fixed)
+        if self.stripes:
+            frame = replace(frame, image=self.stripes.remove_from(frame.image))
+        return frame
+
+    def _mask(self, image: AnyImage) -> Mask | None:
+        """(h, w) the pixels of an image that do not show the specimen, as far as they are known; None where all do."""
         masks = [m for m in (self.overlay, self.fixed) if m is not None]
-        masks = [m for m in masks if m.shape == frame.image.shape[:2]]
+        masks = [m for m in masks if m.shape == image.shape[:2]]
         fixed = np.logical_or.reduce(masks) if masks else np.zeros(1, dtype=bool)
-        if not np.any(fixed):
-            return frame
-        return replace(frame, image=remove_overlay(frame.image, fixed), fixed=fixed)
+        return fixed if np.any(fixed) else None
 
     def look_for_overlay(self, image: AnyImage) -> tuple[StaticParts, bool]:
         """Look in one frame more for what is drawn into them; whether any was found for the first time."""
@@ -112,7 +131,39 @@ class StaticParts:
         What stays in place is forgotten if it is in doubt: where no frame has matched what was left without it, it may
         be the specimen.
         """
-        return replace(self, earlier=None, fixed=None if is_in_doubt else self.fixed)
+        return replace(self, earlier=None, anchor=None, fixed=None if is_in_doubt else self.fixed)
+
+    def _look_for_stripes(
+        self, image: AnyImage, drift_px: Array
+    ) -> tuple[StaticParts, Array | None]:
+        """Look for stripes in a frame, as it came; and by how much new ones may have pulled the drift, px."""
+        anchor = self.anchor
+        if (
+            anchor is None
+            or anchor.image.shape != image.shape
+            or (self.stripes.lines and self.stripes.columns)
+        ):
+            return self, None
+        moved_px = drift_px - anchor.drift_px
+        pair, mask = [anchor.image, image], self._mask(image)
+        if mask is not None:
+            pair = [remove_overlay(one, mask) for one in pair]
+        found = self.stripes | find_stripes(to_levels(pair[0]), to_levels(pair[1]), moved_px)
+        if found == self.stripes:
+            return self, None
+        # To where they went: nowhere, or by any part of a period.
+        return replace(self, stripes=found), moved_px
+
+    @property
+    def looks_for_stripes(self) -> bool:
+        """Whether it is time to try a frame without what may be stripes."""
+        return self.frames <= OVERLAY_FIRST_FRAMES or self.frames % OVERLAY_EVERY_FRAMES == 0
+
+    def suspect_stripes(self, image: AnyImage) -> StaticParts:
+        """The same, with stripes in all directions in which a frame, as it came, may have them."""
+        mask = self._mask(image)
+        whole = image if mask is None else remove_overlay(image, mask)
+        return replace(self, stripes=self.stripes | suspect_stripes(to_levels(whole)))
 
     def look_for_fixed(
         self, image: AnyImage, drift_px: Array, px_from_unit: Array
@@ -146,6 +197,7 @@ class StaticParts:
             if since < every or np.hypot(*moved_px) < FIXED_MOVE_PX_MIN:
                 return replace(self, earlier=replace(earlier, since=since)), None
             parts = replace(self, comparisons=self.comparisons + 1)
+            parts, pulled_px = parts._look_for_stripes(image, drift_px)
             found = find_fixed_parts(earlier.image, image, moved_px)
             if found is not None:
                 known = np.zeros_like(found.stays) if self.fixed is None else self.fixed
@@ -159,4 +211,12 @@ class StaticParts:
         elif self.fixed is not None and self.fixed.shape != image.shape[:2]:
             parts = replace(self, fixed=None)
         latest = EarlierFrame(image.copy(), drift_px, px_from_unit)
+        anchor = parts.anchor
+        if (
+            anchor is None
+            or anchor.image.shape != image.shape
+            or not np.allclose(anchor.px_from_unit, px_from_unit)
+            or np.hypot(*(drift_px - anchor.drift_px)) > STRIPE_MOVE_PX_MAX
+        ):
+            parts = replace(parts, anchor=latest)
         return replace(parts, earlier=latest), pulled_px

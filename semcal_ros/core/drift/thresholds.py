@@ -843,3 +843,51 @@ INTERPOLATED_PX = TABLE.derived(
     "INTERPOLATED_PX", 1, "px",
     "That a cubic interpolation takes beyond the two nearest ones.",
 )
+
+# Stripes, in stripes.py
+
+STRIPE_STRIPS = TABLE.stated(
+    "STRIPE_STRIPS", 6, "strips",
+    "Of an image beside each other, of whose lines the noise differs and stripes do not.",
+)
+STRIPE_CELLS_MIN = TABLE.stated(
+    "STRIPE_CELLS_MIN", 0.9, "of the cells",
+    "In which a strip agrees with the others in sign, of images that have stripes.",
+)
+STRIPE_PARTS = TABLE.stated(
+    "STRIPE_PARTS", 8, "parts",
+    "Of the length of a strip, which are compared for themselves.",
+)
+STRIPE_SMOOTHED_PX = TABLE.stated(
+    "STRIPE_SMOOTHED_PX", 1.0, "px",
+    "Smoothing of what is compared, so that little is left of sharp edges that are interpolated.",
+)
+STRIPE_MOVE_PX_MAX = TABLE.stated(
+    "STRIPE_MOVE_PX_MAX", 16.0, "px",
+    "By which the specimen has moved since the frame that is compared with, before a later one takes its place: half "
+    "of the period of the widest stripes that pull much.",
+)
+STRIPE_SHADING = TABLE.stated(
+    "STRIPE_SHADING", 0.25, "of the image",
+    "Over which brightness changes slowly: shading, which pulls little.",
+)
+STRIPE_CLIP = TABLE.stated(
+    "STRIPE_CLIP", 4.0, "sigma",
+    "At which the means of lines are clipped, so that a few lines of something else do not look like stripes.",
+)
+STRIPE_PROFILE_MIN = TABLE.stated(
+    "STRIPE_PROFILE_MIN", 32, "lines",
+    "Below, their variances are hardly known.",
+)
+STRIPE_SHARE_MAX = TABLE.stated(
+    "STRIPE_SHARE_MAX", 0.3, "of the squared gradients",
+    "That the means of lines have: of a specimen that shows more, it is what the shift across them is told by.",
+)
+STRIPE_TRIES = TABLE.cost(
+    "STRIPE_TRIES", 3, "frames",
+    "That were refused, after which frames are no longer tried without stripes.",
+)
+STRIPE_CHI2_MIN = TABLE.derived(
+    "STRIPE_CHI2_MIN", 25.0, "squared deviations",
+    "Between the shifts with and without stripes: by chance one pair in 270,000 (chi-square of two numbers).",
+)

@@ -55,11 +55,13 @@ from semcal_ros.core.drift.state import initial_state
 from semcal_ros.core.drift.thresholds import (
     CANDIDATES,
     PAUSE_MIN,
+    STRIPE_CHI2_MIN,
+    STRIPE_TRIES,
     VELOCITY_CHANGE,
 )
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import InvalidValueError, Rejection
-from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.failures import STRIPE_FAILURES, MatchFailure
 
 
 def step(
@@ -86,7 +88,9 @@ def step(
         state = _look_for_overlay(setup, state, frame)
         frame = state.static.remove_from(frame)
         state = _predict(setup, state, frame, time_s)
+        before = state
         state, update = _follow(setup, state, frame)
+        state, update, frame = _follow_without_stripes(setup, before, raw, (state, update, frame))
         if update.accepted:
             state, is_pulled = _look_for_fixed(setup, state, frame, raw)
             if is_pulled:
@@ -201,6 +205,40 @@ def _look_for_fixed(
     widened = state.filter.widen_measurements(np.outer(pulled, pulled))
     # The frame is measured once more, and is no repeated one.
     return clean_keyframes(setup, replace(state, filter=widened, sample=b"")), True
+
+
+def _follow_without_stripes(
+    setup: TrackerSetup,
+    state: TrackerState,
+    raw: AnyImage,
+    found: tuple[TrackerState, DriftUpdate, ScanFrame],
+) -> tuple[TrackerState, DriftUpdate, ScanFrame]:
+    """Follow a frame that came as ``raw`` once more from the ``state`` before it, without the brightness that its lines
+    or columns have in common, where it may have stripes; what was ``found`` with them where that changes nothing.
+
+    It is of use where the frame could not be measured, and where the drift is significantly another one without.
+    """
+    with_them, rejection = found[1], found[1].rejection
+    if rejection is None:
+        looks = state.static.looks_for_stripes
+    else:
+        looks = rejection.status in STRIPE_FAILURES and state.rejected < STRIPE_TRIES
+    static = state.static.suspect_stripes(raw) if looks else state.static
+    if static.stripes == state.static.stripes:
+        return found
+    frame = static.remove_from(replace(found[2], image=raw))
+    cleaned = clean_keyframes(setup, replace(state, static=static))
+    freed, without = _follow(setup, cleaned, frame)
+    if not without.accepted or without.along is not None:
+        return found
+    if rejection is None:
+        apart = without.drift_m - with_them.drift_m
+        if float(apart @ np.linalg.solve(without.covariance[:2, :2], apart)) < STRIPE_CHI2_MIN:
+            return found
+        # The frames before were pulled as well.
+        widened = cleaned.filter.widen_measurements(np.outer(apart, apart))
+        freed, without = _follow(setup, replace(cleaned, filter=widened), frame)
+    return freed, without, frame
 
 
 def _conclude(state: TrackerState, frame: ScanFrame, raw: AnyImage, time_s: float) -> TrackerState:

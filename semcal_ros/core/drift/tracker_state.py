@@ -215,5 +215,6 @@ def make_update(
         moving=None if registration is None else registration.moving,
         own_motion=state.body.latest,
         fixed=None if frame.fixed is None else MovingTiles.of_pixels(frame.fixed),
+        stripes=state.static.stripes,
         of_scale=of_scale[:2, :2],
     )

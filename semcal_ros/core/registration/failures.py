@@ -22,7 +22,7 @@ from enum import Enum
 class MatchFailure(Enum):
     """Why an image was not matched with a reference."""
 
-    #: The reference is blank, saturated, too small, without structure, or not finite.
+    #: The reference is blank, too small, without structure, or not finite.
     UNUSABLE_REFERENCE = "unusable reference"
     #: The image is.
     UNUSABLE_IMAGE = "unusable image"
@@ -54,3 +54,15 @@ class MatchFailure(Enum):
 
 #: Failures of the image alone, which say nothing about the reference.
 IMAGE_FAILURES = frozenset({MatchFailure.UNUSABLE_IMAGE, MatchFailure.REPEATED_IMAGE})
+
+#: Failures that stripes in the images may be the cause of.
+STRIPE_FAILURES = frozenset(
+    {
+        MatchFailure.NO_PEAK,
+        MatchFailure.UNDETERMINED,
+        MatchFailure.NOT_CONVERGED,
+        MatchFailure.STAGES_DISAGREE,
+        MatchFailure.HALVES_DISAGREE,
+        MatchFailure.DISSIMILAR,
+    }
+)

@@ -276,6 +276,7 @@ class DriftOutput:
             ("drift_moving_share", 0.0 if measured.moving is None else measured.moving.share),
             *_own_motion_notes(measured),
             ("drift_fixed_share", measured.fixed_share),
+            ("drift_stripes", str(measured.stripes)),
             ("drift_frames_coasted", self._coasting),
             ("drift_frames_forecast", self._forecast),
         )

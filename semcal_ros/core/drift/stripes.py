@@ -1,0 +1,150 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Stripes: brightness that whole lines or columns have in common, and that does not move with the specimen.
+
+The mains put hum on the detector's signal, an amplifier or a charged specimen gives each line its own brightness, a
+converter gives each column its own. Stripes that stay, or roll, pull a shift to their own one, however weak they are:
+they have the same phase all over the image, where the specimen's gradients only add up by their squares.
+
+They show in what a shift leaves of two images: strips of it beside each other have noise of their own, and stripes in
+common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semcal_ros.core.arrays import AnyImage, Array, Image
+from semcal_ros.core.drift.thresholds import (
+    STRIPE_CELLS_MIN,
+    STRIPE_CLIP,
+    STRIPE_PARTS,
+    STRIPE_PROFILE_MIN,
+    STRIPE_SHADING,
+    STRIPE_SHARE_MAX,
+    STRIPE_SMOOTHED_PX,
+    STRIPE_STRIPS,
+)
+
+
+@dataclass(frozen=True)
+class Stripes:
+    """In which directions an image has stripes.
+
+    Attributes
+    ----------
+    lines, columns
+        Whether the lines have brightness of their own, and the columns.
+    """
+
+    lines: bool = False
+    columns: bool = False
+
+    def __str__(self) -> str:
+        """The directions in words, or nothing."""
+        named = (("lines", self.lines), ("columns", self.columns))
+        return " and ".join(name for name, has in named if has)
+
+    def __bool__(self) -> bool:
+        return self.lines or self.columns
+
+    def __or__(self, other: Stripes) -> Stripes:
+        return Stripes(self.lines or other.lines, self.columns or other.columns)
+
+    def remove_from(self, image: AnyImage) -> AnyImage:
+        """The image (h, w) or (h, w, 3) with the same median in all lines, or columns, in single precision."""
+        if not self:
+            return image
+        out = image.astype(np.float32)
+        for axis, has in ((1, self.lines), (0, self.columns)):
+            if has:
+                # A tool may cover nearly half of a line.
+                out -= np.median(out, axis=axis, keepdims=True)
+        return out
+
+
+def find_stripes(before: Image, now: Image, shift_px: Array) -> Stripes:
+    """In which directions two images (h, w) have stripes that did not move by ``shift_px`` (2,) as the specimen did.
+
+    Lines of the specimen along a direction have brightness in common, too, but move with it. For how often noise is
+    taken for stripes, see `STRIPE_CELLS_MIN`.
+    """
+    height, width = now.shape
+    margins = np.ceil(np.abs(shift_px)).astype(int) + 2
+    if np.any(4 * margins > np.array([width, height])):
+        return Stripes()
+    matrix = np.array([[1.0, 0.0, float(shift_px[0])], [0.0, 1.0, float(shift_px[1])]])
+    # Of sharp edges, interpolation leaves more.
+    first, second = (
+        np.asarray(cv2.GaussianBlur(image, (0, 0), STRIPE_SMOOTHED_PX), dtype=np.float32)
+        for image in (before, now)
+    )
+    moved = cv2.warpAffine(first, matrix, (width, height), flags=cv2.INTER_CUBIC)
+    inside = (
+        slice(margins[1], height - margins[1]),
+        slice(margins[0], width - margins[0]),
+    )
+    own, there = second[inside], np.asarray(moved[inside], dtype=np.float32)
+    own, there = own - own.mean(), there - there.mean()
+    gain = float(np.vdot(own, there)) / max(float(np.vdot(there, there)), 1e-30)
+    left = own - np.float32(gain) * there
+    return Stripes(_has_stripes(left, own), _has_stripes(left.T, own.T))
+
+
+def suspect_stripes(image: Image) -> Stripes:
+    """In which directions an image (h, w) has lines with brightness in common: stripes, or a specimen of such lines."""
+    return Stripes(_measure_common(image) is not None, _measure_common(image.T) is not None)
+
+
+def _has_stripes(left: Image, image: Image) -> bool:
+    """Whether the lines of what a shift has ``left`` of an image share brightness that is no structure of it."""
+    common = _measure_common(left)
+    if common is None:
+        return False
+    # A specimen of lines leaves some of them where the shift is a little off, and nothing else tells its place.
+    whole = _profile(image).mean(axis=0)
+    gradient = np.diff(image, axis=0)
+    share = image.shape[1] * float(np.sum(np.diff(whole) ** 2)) / float(np.sum(gradient**2))
+    return share < STRIPE_SHARE_MAX or float(np.sum(common**2)) > 0.5 * float(np.sum(whole**2))
+
+
+def _measure_common(image: Image) -> Array | None:
+    """(lines,) brightness that the lines of an image have in common over its width; None where it is that of chance.
+
+    Each strip is compared with the mean of the others in parts of its length. Stripes are everywhere: nearly all of
+    these cells agree in sign, where noise does in half of them, and a tool or the edge of a shadow are in some.
+    """
+    profiles = _profile(image)
+    strips, count = profiles.shape
+    if count < STRIPE_PROFILE_MIN:
+        return None
+    common = profiles.mean(axis=0)
+    others = (strips * common - profiles) / (strips - 1)
+    starts = np.linspace(0, count, STRIPE_PARTS, endpoint=False).astype(int)
+    cells = np.add.reduceat(profiles * others, starts, axis=1)
+    return common if np.mean(cells > 0.0) >= STRIPE_CELLS_MIN else None
+
+
+def _profile(image: Image) -> Array:
+    """(strips, lines) means of the lines of an image in strips beside each other, without what changes slowly."""
+    strips = np.array_split(np.asarray(image, dtype=np.float32), STRIPE_STRIPS, axis=1)
+    profiles = np.array([strip.mean(axis=1) for strip in strips])
+    window = max(3, int(STRIPE_SHADING * profiles.shape[1]) | 1)
+    profiles = profiles - cv2.blur(profiles, (window, 1), borderType=cv2.BORDER_REFLECT)
+    limit = STRIPE_CLIP * 1.4826 * np.median(np.abs(profiles), axis=1, keepdims=True)
+    return np.clip(profiles, -limit, limit).astype(np.float64)
