@@ -159,11 +159,13 @@ class StaticParts:
         """Whether it is time to try a frame without what may be stripes."""
         return self.frames <= OVERLAY_FIRST_FRAMES or self.frames % OVERLAY_EVERY_FRAMES == 0
 
-    def suspect_stripes(self, image: AnyImage) -> StaticParts:
-        """The same, with stripes in all directions in which a frame, as it came, may have them."""
+    def suspect_stripes(self, image: AnyImage, least: float) -> StaticParts:
+        """The same, with stripes in all directions in which a frame, as it came, may have them: of ``least`` of its
+        cells.
+        """
         mask = self._mask(image)
         whole = image if mask is None else remove_overlay(image, mask)
-        return replace(self, stripes=self.stripes | suspect_stripes(to_levels(whole)))
+        return replace(self, stripes=self.stripes | suspect_stripes(to_levels(whole), least))
 
     def look_for_fixed(
         self, image: AnyImage, drift_px: Array, px_from_unit: Array

@@ -106,14 +106,18 @@ def find_stripes(before: Image, now: Image, shift_px: Array) -> Stripes:
     return Stripes(_has_stripes(left, own), _has_stripes(left.T, own.T))
 
 
-def suspect_stripes(image: Image) -> Stripes:
-    """In which directions an image (h, w) has lines with brightness in common: stripes, or a specimen of such lines."""
-    return Stripes(_measure_common(image) is not None, _measure_common(image.T) is not None)
+def suspect_stripes(image: Image, least: float = STRIPE_CELLS_MIN) -> Stripes:
+    """In which directions an image (h, w) has lines with brightness in common: stripes, or a specimen of such lines.
+
+    ``least`` is the part of the cells that agree.
+    """
+    found = (_measure_common(each, least) is not None for each in (image, image.T))
+    return Stripes(*found)
 
 
 def _has_stripes(left: Image, image: Image) -> bool:
     """Whether the lines of what a shift has ``left`` of an image share brightness that is no structure of it."""
-    common = _measure_common(left)
+    common = _measure_common(left, STRIPE_CELLS_MIN)
     if common is None:
         return False
     # A specimen of lines leaves some of them where the shift is a little off, and nothing else tells its place.
@@ -123,7 +127,7 @@ def _has_stripes(left: Image, image: Image) -> bool:
     return share < STRIPE_SHARE_MAX or float(np.sum(common**2)) > 0.5 * float(np.sum(whole**2))
 
 
-def _measure_common(image: Image) -> Array | None:
+def _measure_common(image: Image, least: float) -> Array | None:
     """(lines,) brightness that the lines of an image have in common over its width; None where it is that of chance.
 
     Each strip is compared with the mean of the others in parts of its length. Stripes are everywhere: nearly all of
@@ -137,7 +141,7 @@ def _measure_common(image: Image) -> Array | None:
     others = (strips * common - profiles) / (strips - 1)
     starts = np.linspace(0, count, STRIPE_PARTS, endpoint=False).astype(int)
     cells = np.add.reduceat(profiles * others, starts, axis=1)
-    return common if np.mean(cells > 0.0) >= STRIPE_CELLS_MIN else None
+    return common if np.mean(cells > 0.0) >= least else None
 
 
 def _profile(image: Image) -> Array:

@@ -854,6 +854,10 @@ STRIPE_CELLS_MIN = TABLE.stated(
     "STRIPE_CELLS_MIN", 0.9, "of the cells",
     "In which a strip agrees with the others in sign, of images that have stripes.",
 )
+STRIPE_CELLS_TRIED = TABLE.cost(
+    "STRIPE_CELLS_TRIED", 0.65, "of the cells",
+    "From which a frame is followed once more without them: one picture of noise in ten. The shift decides.",
+)
 STRIPE_PARTS = TABLE.stated(
     "STRIPE_PARTS", 8, "parts",
     "Of the length of a strip, which are compared for themselves.",

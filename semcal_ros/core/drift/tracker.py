@@ -55,6 +55,8 @@ from semcal_ros.core.drift.state import initial_state
 from semcal_ros.core.drift.thresholds import (
     CANDIDATES,
     PAUSE_MIN,
+    STRIPE_CELLS_MIN,
+    STRIPE_CELLS_TRIED,
     STRIPE_CHI2_MIN,
     STRIPE_TRIES,
     VELOCITY_CHANGE,
@@ -223,7 +225,9 @@ def _follow_without_stripes(
         looks = state.static.looks_for_stripes
     else:
         looks = rejection.status in STRIPE_FAILURES and state.rejected < STRIPE_TRIES
-    static = state.static.suspect_stripes(raw) if looks else state.static
+    # What was measured says by itself whether stripes make a difference.
+    least = STRIPE_CELLS_MIN if rejection is not None else STRIPE_CELLS_TRIED
+    static = state.static.suspect_stripes(raw, least) if looks else state.static
     if static.stripes == state.static.stripes:
         return found
     frame = static.remove_from(replace(found[2], image=raw))
