@@ -41,7 +41,7 @@ from semcal_ros.core.drift.estimates import DriftPredictor, DriftStatus, DriftUp
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import use_match
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
-from semcal_ros.core.drift.gating import inflate_after_pause
+from semcal_ros.core.drift.gating import inflate_after_pause, inflate_position
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.matching import Match, RejectedMatch, free_of_pull, match_keyframe
@@ -62,6 +62,13 @@ from semcal_ros.core.drift.thresholds import (
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.failures import STRIPE_FAILURES, MatchFailure
+
+# Noise never comes twice: the scan is paused, or the driver sent the frame again.
+_REPEATED_IMAGE = Rejection(MatchFailure.REPEATED_IMAGE, "image: the same as the previous frame")
+_REPEATED_TIME = Rejection(
+    MatchFailure.REPEATED_TIME,
+    "time: the same as that of the previous frame, before any drift is known: give each frame its own stamp",
+)
 
 
 def step(
@@ -133,8 +140,7 @@ def _predict(
     """Predict the state at the time of the frame."""
     drift_filter = state.filter
     dt = time_s - drift_filter.state.time_s
-    knows_motion = drift_filter.measured > 0 or np.any(drift_filter.state.drift_covariance[2:, 2:])
-    if dt > 0.0 and not knows_motion:
+    if dt > 0.0 and not drift_filter.knows_motion:
         # The second frame tells the interval, and how far drift gets in it is all that is known
         # of the velocity.
         unit_from_px = np.linalg.inv(frame.px_from_unit)
@@ -149,7 +155,12 @@ def _predict(
     )
     if 0.0 < PAUSE_MIN * drift_filter.process_noise.time_constant_s < dt:
         state = state.inflate(inflate_after_pause(speed, dt))
-    return state
+    # Two frames are never taken at once: one with the time of the frame before was taken up to an interval later.
+    late_s = drift_filter.interval_s if dt == 0.0 and frame.sample != state.sample else 0.0
+    reach = speed * max(late_s, state.late_s)
+    if reach > 0.0:
+        state = state.inflate(inflate_position(np.eye(2) * reach**2))
+    return replace(state, late_s=late_s)
 
 
 def _follow(
@@ -159,6 +170,10 @@ def _follow(
     settings, sample = setup.settings, frame.sample
     is_repeated = sample == state.sample
     state = replace(state, sample=sample)
+    if not state.filter.knows_motion:
+        # A frame at another time tells the prior of the motion; without any, a shift would be taken for noise.
+        flaw = _REPEATED_IMAGE if is_repeated else _REPEATED_TIME
+        return coast(setup, state, frame, [RejectedMatch.unseen(flaw)], rescaled=False)
     candidates = state.keyframes.candidates(
         state.filter.state, frame, settings.rekey_overlap, settings.max_ratio
     )
@@ -175,10 +190,7 @@ def _follow(
     for candidate in candidates[: CANDIDATES if is_steady else 2 * CANDIDATES]:
         state, match = match_keyframe(setup, state, frame, candidate)
         if isinstance(match, Match) and is_repeated:
-            # Noise never comes twice: the scan is paused, or the driver sent the frame again.
-            reason = "image: the same as the previous frame"
-            repeated = Rejection(MatchFailure.REPEATED_IMAGE, reason)
-            match = RejectedMatch(repeated, match.registration)
+            match = RejectedMatch(_REPEATED_IMAGE, match.registration)
         if isinstance(match, Match):
             state, match = free_of_pull(setup, state, frame, match)
             state, refused = use_match(setup, state, frame, match)

@@ -80,6 +80,8 @@ class TrackerState:
         Those of the latest frame.
     sample
         Some of its pixels, by which an image that comes again is recognised.
+    late_s
+        By how much later than its time it may have been taken: an interval where the frame before has the same time.
     outliers
         The test of shifts that were not expected.
     rejected
@@ -103,6 +105,7 @@ class TrackerState:
     camera: ScanCamera | None
     time_s: float
     sample: bytes
+    late_s: float = 0.0
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
@@ -118,6 +121,14 @@ class TrackerState:
         """
         has_same_unit = (self.camera is None) == (frame.camera is None)
         return time_s >= self.time_s and has_same_unit and len(self.keyframes) > 0
+
+    @property
+    def previous_s(self) -> float:
+        """Time of the frame before, seen from the one that is being followed: where both have the same, a typical
+        interval earlier.
+        """
+        now_s = self.filter.state.time_s
+        return self.time_s if now_s > self.time_s else now_s - self.filter.interval_s
 
     def unseen_covariance(self, px_from_unit: Array) -> Array:
         """(2, 2) covariance of the drift along lines, which has only been predicted since they alone are seen."""
