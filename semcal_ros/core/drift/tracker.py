@@ -86,11 +86,13 @@ def step(
         The frame.
     time_s
         Centre of its acquisition. A time before that of the last frame begins anew, and so does a stream that gains or
-        loses its camera, because its unit changes.
+        loses its camera, because its unit changes; the update says ``restarted``.
     """
     raw = frame.image
     if state is None or not state.goes_on_with(frame, time_s):
-        state, update = _begin(setup, frame, time_s)
+        # Without a keyframe, no drift was counted from a frame before.
+        restarted = state is not None and len(state.keyframes) > 0
+        state, update = _begin(setup, frame, time_s, restarted=restarted)
     else:
         state = _look_for_overlay(setup, state, frame)
         frame = state.static.remove_from(frame)
@@ -107,9 +109,9 @@ def step(
 
 
 def _begin(
-    setup: TrackerSetup, frame: ScanFrame, time_s: float
+    setup: TrackerSetup, frame: ScanFrame, time_s: float, *, restarted: bool
 ) -> tuple[TrackerState, DriftUpdate]:
-    """Start with zero drift."""
+    """Start with zero drift; ``restarted`` says whether the drift was counted from another frame before."""
     start = initial_state(time_s, centre_covariance(frame.camera))
     psd, kept = setup.settings.acceleration_psd, setup.keeps_history
     state = TrackerState(
@@ -123,8 +125,9 @@ def _begin(
     state, rejection = add_keyframe(setup, state, frame, np.zeros(4))
     if rejection is not None:
         # Nothing can be measured against such an image: wait for a better one.
-        return state, make_update(state, frame, DriftStatus.COASTING, rejection)
-    return state, make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0)
+        coasting = DriftStatus.COASTING
+        return state, make_update(state, frame, coasting, rejection, restarted=restarted)
+    return state, make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0, restarted=restarted)
 
 
 def _look_for_overlay(setup: TrackerSetup, state: TrackerState, frame: ScanFrame) -> TrackerState:
@@ -327,10 +330,11 @@ class DriftTracker:
         image
             (h, w) or (h, w, 3) image of integers or floats.
         time_s
-            Start of its acquisition. A time before that of the last frame resets the tracker.
+            Start of its acquisition. A time before that of the last frame begins anew at zero drift, and the update
+            says ``restarted``.
         camera
             Camera of this frame's magnification; None tracks in raw pixels. A stream that gains or
-            loses its camera starts again, because its unit changes.
+            loses its camera begins anew, too, because its unit changes.
         timing
             Raster timing; None takes the frame as an instant at ``time_s``.
         rectified

@@ -24,7 +24,7 @@ from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.failures import MatchFailure
-from tests.helpers.drift_scenes import Texture, noisy
+from tests.helpers.drift_scenes import Texture, noisy, small_camera
 
 TEXTURE = Texture(seed=4, n=512)
 # Drift from one frame to the next, px.
@@ -112,3 +112,39 @@ def test_frames_of_the_same_time_that_match_nothing_leave_the_velocity_finite() 
     assert any(u.restarted for u in lost)
     # The first step's sigma, 10 px, in each interval.
     assert all(np.all(np.diag(u.covariance)[2:] < 100.0**2) for u in lost)
+
+
+@pytest.mark.parametrize("is_blank", [False, True], ids=["seen", "blank"])
+def test_a_time_that_goes_back_begins_anew_and_says_so(is_blank: bool) -> None:
+    history = DriftHistory()
+    tracker = DriftTracker(history=history)
+    live = []
+    for k in range(9):
+        image = np.zeros((192, 192), np.uint8) if is_blank and k == 4 else frame(k)
+        live.append(tracker.update(image, float(k if k < 4 else k - 3)))
+    first = 5 if is_blank else 4
+    assert live[first].status_text == "keyframe" and np.all(live[first].drift_m == 0.0)
+    for path in (DriftPath(live), history.smooth()):
+        assert path.restarted.tolist() == [k == 4 for k in range(9)]
+        # What is counted from another frame is no drift since the first one.
+        assert path.trusted.tolist() == [k < 4 for k in range(9)]
+        errors = errors_px(list(path.updates))[first:] + first * STEP_PX
+        assert float(np.max(np.abs(errors))) < 0.05
+
+
+def test_a_stream_that_gains_a_camera_begins_anew_and_says_so() -> None:
+    tracker = DriftTracker()
+    camera = small_camera(2000.0)
+    updates = [tracker.update(frame(k), float(k), camera if k >= 2 else None) for k in range(4)]
+    assert [u.restarted for u in updates] == [False, False, True, False]
+
+
+def test_to_begin_late_or_to_be_reset_is_no_restart() -> None:
+    """Nothing was counted from a frame before."""
+    tracker = DriftTracker()
+    blank = np.zeros((192, 192), np.uint8)
+    updates = [tracker.update(f, t) for f, t in ((blank, 3.0), (blank, 2.0), (frame(0), 4.0))]
+    tracker.reset()
+    updates.append(tracker.update(frame(1), 0.0))
+    assert [u.accepted for u in updates] == [False, False, True, True]
+    assert not any(u.restarted for u in updates)
