@@ -59,6 +59,7 @@ from semcal_ros.core.drift.thresholds import (
     STRIPE_TRIES,
     VELOCITY_CHANGE,
 )
+from semcal_ros.core.drift.torn_frames import TearTest
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.failures import STRIPE_FAILURES, MatchFailure
@@ -94,6 +95,7 @@ def step(
         restarted = state is not None and len(state.keyframes) > 0
         state, update = _begin(setup, frame, time_s, restarted=restarted)
     else:
+        state = replace(state, tears=state.tears.look_at(raw))
         state = _look_for_overlay(setup, state, frame)
         frame = state.static.remove_from(frame)
         state = _predict(setup, state, frame, time_s)
@@ -121,6 +123,7 @@ def _begin(
         camera=frame.camera,
         time_s=time_s,
         sample=frame.sample,
+        tears=TearTest().look_at(frame.image),
     )
     state, rejection = add_keyframe(setup, state, frame, np.zeros(4))
     if rejection is not None:
@@ -132,6 +135,9 @@ def _begin(
 
 def _look_for_overlay(setup: TrackerSetup, state: TrackerState, frame: ScanFrame) -> TrackerState:
     """Look for what is drawn into the frames; the first time, the keyframes are freed of it."""
+    if state.tears.share > 0.0:
+        # A part of a torn frame is the same as before, too.
+        return state
     static, is_new = state.static.look_for_overlay(frame.image)
     state = replace(state, static=static)
     return clean_keyframes(setup, state) if is_new else state
@@ -173,9 +179,8 @@ def _follow(
     settings, sample = setup.settings, frame.sample
     is_repeated = sample == state.sample
     state = replace(state, sample=sample)
-    if not state.filter.knows_motion:
-        # A frame at another time tells the prior of the motion; without any, a shift would be taken for noise.
-        flaw = _REPEATED_IMAGE if is_repeated else _REPEATED_TIME
+    flaw = _find_flaw(state, is_repeated=is_repeated)
+    if flaw is not None:
         return coast(setup, state, frame, [RejectedMatch.unseen(flaw)], rescaled=False)
     candidates = state.keyframes.candidates(
         state.filter.state, frame, settings.rekey_overlap, settings.max_ratio
@@ -202,6 +207,18 @@ def _follow(
             match = refused
         rejected.append(match)
     return coast(setup, state, frame, rejected, rescaled=candidates[0].rescaled)
+
+
+def _find_flaw(state: TrackerState, *, is_repeated: bool) -> Rejection[MatchFailure] | None:
+    """Why a frame is not used, whatever it shows; None where nothing speaks against it."""
+    if state.tears.share > 0.0:
+        share = 100.0 * state.tears.share
+        reason = f"image: torn: {share:.0f} % of its lines are those of the previous frame"
+        return Rejection(MatchFailure.REPEATED_IMAGE, reason)
+    if not state.filter.knows_motion:
+        # A frame at another time tells the prior of the motion; without any, a shift would be taken for noise.
+        return _REPEATED_IMAGE if is_repeated else _REPEATED_TIME
+    return None
 
 
 def _look_for_fixed(
@@ -264,7 +281,7 @@ def _conclude(state: TrackerState, frame: ScanFrame, raw: AnyImage, time_s: floa
         similarity=state.similarity.mark_frame(state.filter.state.time_s),
         camera=frame.camera,
         time_s=time_s,
-        static=state.static.keep(raw),
+        static=state.static if state.tears.share > 0.0 else state.static.keep(raw),
         lines=replace(state.lines, of_unseen=state.unseen_covariance(frame.px_from_unit)),
     )
 

@@ -39,6 +39,7 @@ from semcal_ros.core.drift.own_motion import OwnMotionEstimator
 from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState, turn_drift
 from semcal_ros.core.drift.static_parts import StaticParts
+from semcal_ros.core.drift.torn_frames import TearTest
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.failures import MatchFailure
@@ -93,6 +94,8 @@ class TrackerState:
         What did not move with the specimen in the last frame that matched, and what measures its motion.
     static
         What never moves.
+    tears
+        The test for frames of which a part is that of the frame before.
     lines
         What is known where lines alone are seen.
     flicker
@@ -112,6 +115,7 @@ class TrackerState:
     moving: MovingTiles | None = None
     body: OwnMotionEstimator = field(default_factory=OwnMotionEstimator)
     static: StaticParts = field(default_factory=StaticParts)
+    tears: TearTest = field(default_factory=TearTest)
     lines: LinesOnly = field(default_factory=LinesOnly)
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
 

@@ -26,7 +26,7 @@ class MatchFailure(Enum):
     UNUSABLE_REFERENCE = "unusable reference"
     #: The image is.
     UNUSABLE_IMAGE = "unusable image"
-    #: The image is the one before once more, down to its noise.
+    #: The image, or a part of it, is the one before once more, down to its noise.
     REPEATED_IMAGE = "repeated image"
     #: It has the time of the one before.
     REPEATED_TIME = "repeated time"
