@@ -48,6 +48,9 @@ GIVE_FRAME_TIME = "give the time of one pass as --frame-time or in a configurati
 # the whole interval, the rows of a frame are then displaced by 0.5 / sqrt(12) = 0.14 px RMS.
 _FAST_PX = 0.5
 
+# Stated: frames that a note names; the table has them all.
+_NAMED = 3
+
 
 def camera_for(
     frame: RecordedFrame, model: Calibration | None, config: MicroscopeConfig
@@ -151,6 +154,26 @@ def estimate_timing(
         f"the configuration has no scan; drift of up to {step_px:.1f} px from frame to frame may "
         f"shear the frames, too; {GIVE_FRAME_TIME}"
     )
+
+
+def describe_beginnings(path: DriftPath) -> list[str]:
+    """Describe from which frames the drift is counted, where it is not the first one for all; frames count from 1."""
+    notes = []
+    first = int(np.argmax(path.accepted))
+    if first > 0:
+        which = "frame 1" if first == 1 else f"frames 1 to {first}"
+        notes.append(
+            f"drift is counted from frame {first + 1}: {which} could not be used ({path[0].reason})"
+        )
+    back = 1 + np.flatnonzero(np.diff(path.time_s) < 0.0)
+    if back.size:
+        which = ", ".join(str(k + 1) for k in back[:_NAMED])
+        more = f" and {back.size - _NAMED} more" if back.size > _NAMED else ""
+        notes.append(
+            f"time runs backwards at {'frame' if back.size == 1 else 'frames'} {which}{more}: "
+            "from there on, drift is counted from that frame"
+        )
+    return notes
 
 
 def _format_with_sigma(value: float, sigma: float) -> str:

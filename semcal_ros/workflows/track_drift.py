@@ -41,6 +41,7 @@ from semcal_ros.workflows.follow_drift import (
     GIVE_FRAME_TIME,
     DriftFollower,
     camera_for,
+    describe_beginnings,
     estimate_timing,
     start_time_s,
 )
@@ -170,14 +171,15 @@ class DriftOptions:
 def track_drift(source: Source, options: DriftOptions) -> DriftTrack:
     """Measure the drift of the specimen at the centre of each frame, relative to the first one.
 
-    What lay at X in the sem frame is seen at X + drift. Where the configuration has no scan timing
+    What lay at X in the sem frame is seen at X + drift. Where time runs backwards in the recording, or its first frames
+    cannot be used, drift is counted from a later frame, which a note says. Where the configuration has no scan timing
     and the drift shows it, the recording is tracked once more with it. ``source`` is a bag, a folder of
     SEM TIFF files, or (image, magnification[, time_s]) tuples in memory.
 
     Raises
     ------
     SemcalError
-        If calibration, configuration or recording cannot be read, or time runs backwards in it.
+        If calibration, configuration or recording cannot be read.
 
     Examples
     --------
@@ -208,6 +210,7 @@ def track_recording(source: Source, options: DriftOptions) -> DriftTrack:
             on_progress("smoothing", 0, None)
         notes = [*opened.notes, *([note] if note else [])]
     path = follower.path(live=live)
+    notes += describe_beginnings(path)
     if path.turns:
         notes.append(_describe_similarity(path))
     if len(path) and path[-1].stripes:

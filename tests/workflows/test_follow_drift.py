@@ -27,7 +27,7 @@ from semcal_ros.config.config import load_config
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
-from semcal_ros.workflows.follow_drift import estimate_timing
+from semcal_ros.workflows.follow_drift import describe_beginnings, estimate_timing
 from tests.helpers.drift_scenes import make_drift_update
 
 LOST = Rejection(MatchFailure.NO_PEAK, "lost")
@@ -61,3 +61,42 @@ def test_fast_drift_is_noted_where_the_shear_of_the_frames_is_unknown(
 
 def test_frames_that_were_only_predicted_do_not_count() -> None:
     assert note_of(updates(0.1, rejected=(3, 7))) == ""
+
+
+def path_of(times: Sequence[float], refused: Sequence[int] = ()) -> DriftPath:
+    blank = Rejection(MatchFailure.UNUSABLE_IMAGE, "blank (all pixels at 0)")
+    return DriftPath(
+        [
+            make_drift_update(time_s=t, rejection=blank if k in refused else None)
+            for k, t in enumerate(times)
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        (path_of([0.0, 1.0, 1.0, 2.0], refused=[2, 3]), []),
+        (path_of([0.0, 1.0], refused=[0, 1]), []),
+        (
+            path_of([0.0, 1.0], refused=[0]),
+            ["drift is counted from frame 2: frame 1 could not be used (blank (all pixels at 0))"],
+        ),
+        (
+            path_of([0.0, 1.0, 2.0, 3.0, 1.5], refused=[0, 1, 2]),
+            [
+                "drift is counted from frame 4: frames 1 to 3 could not be used (blank (all pixels at 0))",
+                "time runs backwards at frame 5: from there on, drift is counted from that frame",
+            ],
+        ),
+        (
+            path_of([5.0, 4.0, 3.0, 2.0, 1.0, 0.0]),
+            [
+                "time runs backwards at frames 2, 3, 4 and 2 more: "
+                "from there on, drift is counted from that frame"
+            ],
+        ),
+    ],
+)
+def test_from_which_frame_drift_is_counted_is_said(path: DriftPath, said: list[str]) -> None:
+    assert describe_beginnings(path) == said

@@ -63,6 +63,20 @@ def test_every_agreed_name_is_there():
         semcal_ros.measure_everything  # noqa: B018
 
 
+def test_from_which_frame_drift_is_counted_is_a_note(frames):
+    blank = np.zeros_like(frames[0][0])
+    images = [blank, *(f[0] for f in frames[1:])]
+    times = [0.0, 1.0, 2.0, 1.5, 3.0]
+    noted = [
+        "drift is counted from frame 2: frame 1 could not be used (blank (all pixels at 0))",
+        "time runs backwards at frame 4: from there on, drift is counted from that frame",
+    ]
+    recording = [(image, G, t) for image, t in zip(images, times, strict=True)]
+    track = track_drift(recording, config="virtual_sem")
+    assert list(track.notes) == noted
+    assert track.path.trusted.tolist() == [False, True, True, False, False]
+
+
 def test_drift_of_images_in_memory(frames, tmp_path):
     seen = []
     track = track_drift(frames, config="virtual_sem", on_progress=lambda *a: seen.append(a))

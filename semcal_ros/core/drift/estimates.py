@@ -121,8 +121,9 @@ class DriftUpdate(DriftEstimate):
     calibrated
         False where no camera was given.
     restarted
-        Whether tracking went on from here at a drift that was only predicted: the frames from here
-        on are consistent with each other, but may show another place than those before.
+        Whether the drift from here on is not tied to that before: tracking went on at a drift that was only
+        predicted, and the frames from here on may show another place; or it began anew at zero, since the time goes
+        back or the unit changes. The frames from here on are consistent with each other.
     shear_px, shear_covariance
         (2,) by how much more the last row is shifted against the keyframe than the first, after the
         known motion was removed, and its (2, 2) covariance; NaN and infinite where it was not
@@ -391,7 +392,7 @@ class DriftPath:
 
     @cached_property
     def restarted(self) -> Mask:
-        """(n,) bool: whether tracking went on from the frame at a drift that was only predicted."""
+        """(n,) bool: whether the drift from the frame on is not tied to that before it."""
         return np.array([u.restarted for u in self.updates], dtype=bool)
 
     @property

@@ -126,6 +126,16 @@ class DriftFilter:
         """Number of the keyframe that nothing was registered against yet."""
         return None if self.unmeasured is None else self.unmeasured.operation.key
 
+    @property
+    def knows_motion(self) -> bool:
+        """Whether anything is known of the velocity: its prior, or more."""
+        return self.measured > 0 or bool(np.any(self.state.drift_covariance[2:, 2:]))
+
+    @property
+    def interval_s(self) -> float:
+        """Typical time from one frame to the next; 0 before it is known."""
+        return self.process_noise.time_constant_s / TIME_CONSTANT_FRAMES
+
     def apply(self, operation: Operation) -> DriftFilter:
         """The filter after an operation on its state."""
         state = operation(self.state, self.process_noise)

@@ -62,7 +62,7 @@ def use_match(
         frame,
         share=match.registration.share,
         is_first=state.filter.measured == 0,
-        last_s=state.time_s,
+        last_s=state.previous_s,
         first_step_px=setup.settings.first_step_px,
         max_jump=setup.settings.max_jump,
     )

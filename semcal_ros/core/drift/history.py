@@ -97,6 +97,10 @@ class DriftHistory:
                 zip(stretch.updates, states, turns, strict=True)
             ):
                 camera = self._cameras[len(updates)]
+                if k > 0 and update.time_s == stretch.updates[k - 1].time_s:
+                    # It was not taken at that time, to which the path belongs.
+                    updates.append(update)
+                    continue
                 smoothed = _smoothed(update, state, turn, camera)
                 smoothed.covariance[:2, :2] += update.unseen
                 if not resolved[k]:

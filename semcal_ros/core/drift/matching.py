@@ -44,6 +44,7 @@ from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.rectification.raw_positions import similarity_matrix
 from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.inverse_compositional import unmeasured_alignment
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.register import Registration, register
 
@@ -103,6 +104,11 @@ class RejectedMatch:
     rejection: Rejection[MatchFailure]
     registration: Registration
     disputed: Array | None = None
+
+    @classmethod
+    def unseen(cls, rejection: Rejection[MatchFailure]) -> RejectedMatch:
+        """That of a frame that is not registered at all."""
+        return cls(rejection, Registration(unmeasured_alignment(), float("nan"), rejection))
 
 
 def match_keyframe(

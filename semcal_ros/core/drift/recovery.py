@@ -54,7 +54,7 @@ def coast(
     doubt = _doubt(setup, state, frame, rejected)
     # A blanked beam says nothing about the keyframe.
     is_of_keyframe = rejection.status not in IMAGE_FAILURES
-    last_s, drift = state.time_s, state.filter.state
+    last_s, drift = state.previous_s, state.filter.state
     state = replace(
         state,
         doubt=state.doubt if doubt is None else doubt,

@@ -279,6 +279,39 @@ GRADIENTS_ALLOWED = TABLE.stated(
     "smaller.",
 )
 
+# Torn frames, in torn_frames.py
+
+TORN_LINE_PARTS = TABLE.stated(
+    "TORN_LINE_PARTS", 4, "parts",
+    "Of a line that are compared each by itself: the digits of a clock change in one or two of them, noise in all.",
+)
+TORN_CHANGES_MIN = TABLE.stated(
+    "TORN_CHANGES_MIN", 0.75, "of the parts with noise",
+    "That must have changed before, where a line is old: three of four.",
+)
+TORN_REVERSALS_MIN = TABLE.derived(
+    "TORN_REVERSALS_MIN", 0.25, "of the pixels",
+    "At which grey levels with noise turn from rising to falling, or back: two thirds where noise is white, 0.39 after "
+    "a Gaussian blur by 1 px (Rice 1945).",
+)
+TORN_STEPS_MIN = TABLE.derived(
+    "TORN_STEPS_MIN", 0.6, "of the pixels",
+    "That differ from the one before: noise of 0.7 grey levels and more does it. Of a drawn text, where strokes are a "
+    "pixel wide, half do.",
+)
+TORN_LINES_MIN = TABLE.stated(
+    "TORN_LINES_MIN", 4, "lines",
+    "That must be old: fields and pairs of lines that are refreshed by turns have one or two at an edge.",
+)
+TORN_SHARE_MIN = TABLE.derived(
+    "TORN_SHARE_MIN", 0.02, "of the lines",
+    "That must be old: fewer pull a frame by no more than 0.02 of the drift between two frames.",
+)
+TORN_CHECKED_LINES = TABLE.cost(
+    "TORN_CHECKED_LINES", 16, "lines",
+    "Of the old ones that are looked at for noise.",
+)
+
 # Overlays, in overlay.py
 
 OVERLAY_TEXT_PX = TABLE.stated(

@@ -41,7 +41,7 @@ from semcal_ros.core.drift.estimates import DriftPredictor, DriftStatus, DriftUp
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import use_match
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
-from semcal_ros.core.drift.gating import inflate_after_pause
+from semcal_ros.core.drift.gating import inflate_after_pause, inflate_position
 from semcal_ros.core.drift.history import DriftHistory
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.matching import Match, RejectedMatch, free_of_pull, match_keyframe
@@ -61,9 +61,17 @@ from semcal_ros.core.drift.thresholds import (
     STRIPE_TRIES,
     VELOCITY_CHANGE,
 )
+from semcal_ros.core.drift.torn_frames import TearTest
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.failures import STRIPE_FAILURES, MatchFailure
+
+# Noise never comes twice: the scan is paused, or the driver sent the frame again.
+_REPEATED_IMAGE = Rejection(MatchFailure.REPEATED_IMAGE, "image: the same as the previous frame")
+_REPEATED_TIME = Rejection(
+    MatchFailure.REPEATED_TIME,
+    "time: the same as that of the previous frame, before any drift is known: give each frame its own stamp",
+)
 
 
 def step(
@@ -81,12 +89,15 @@ def step(
         The frame.
     time_s
         Centre of its acquisition. A time before that of the last frame begins anew, and so does a stream that gains or
-        loses its camera, because its unit changes.
+        loses its camera, because its unit changes; the update says ``restarted``.
     """
     raw = frame.image
     if state is None or not state.goes_on_with(frame, time_s):
-        state, update = _begin(setup, frame, time_s)
+        # Without a keyframe, no drift was counted from a frame before.
+        restarted = state is not None and len(state.keyframes) > 0
+        state, update = _begin(setup, frame, time_s, restarted=restarted)
     else:
+        state = replace(state, tears=state.tears.look_at(raw))
         state = _look_for_overlay(setup, state, frame)
         frame = state.static.remove_from(frame)
         state = _predict(setup, state, frame, time_s)
@@ -102,9 +113,9 @@ def step(
 
 
 def _begin(
-    setup: TrackerSetup, frame: ScanFrame, time_s: float
+    setup: TrackerSetup, frame: ScanFrame, time_s: float, *, restarted: bool
 ) -> tuple[TrackerState, DriftUpdate]:
-    """Start with zero drift."""
+    """Start with zero drift; ``restarted`` says whether the drift was counted from another frame before."""
     start = initial_state(time_s, centre_covariance(frame.camera))
     psd, kept = setup.settings.acceleration_psd, setup.keeps_history
     state = TrackerState(
@@ -114,16 +125,21 @@ def _begin(
         camera=frame.camera,
         time_s=time_s,
         sample=frame.sample,
+        tears=TearTest().look_at(frame.image),
     )
     state, rejection = add_keyframe(setup, state, frame, np.zeros(4))
     if rejection is not None:
         # Nothing can be measured against such an image: wait for a better one.
-        return state, make_update(state, frame, DriftStatus.COASTING, rejection)
-    return state, make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0)
+        coasting = DriftStatus.COASTING
+        return state, make_update(state, frame, coasting, rejection, restarted=restarted)
+    return state, make_update(state, frame, DriftStatus.KEYFRAME, overlap=1.0, restarted=restarted)
 
 
 def _look_for_overlay(setup: TrackerSetup, state: TrackerState, frame: ScanFrame) -> TrackerState:
     """Look for what is drawn into the frames; the first time, the keyframes are freed of it."""
+    if state.tears.share > 0.0:
+        # A part of a torn frame is the same as before, too.
+        return state
     static, is_new = state.static.look_for_overlay(frame.image)
     state = replace(state, static=static)
     return clean_keyframes(setup, state) if is_new else state
@@ -135,8 +151,7 @@ def _predict(
     """Predict the state at the time of the frame."""
     drift_filter = state.filter
     dt = time_s - drift_filter.state.time_s
-    knows_motion = drift_filter.measured > 0 or np.any(drift_filter.state.drift_covariance[2:, 2:])
-    if dt > 0.0 and not knows_motion:
+    if dt > 0.0 and not drift_filter.knows_motion:
         # The second frame tells the interval, and how far drift gets in it is all that is known
         # of the velocity.
         unit_from_px = np.linalg.inv(frame.px_from_unit)
@@ -151,7 +166,12 @@ def _predict(
     )
     if 0.0 < PAUSE_MIN * drift_filter.process_noise.time_constant_s < dt:
         state = state.inflate(inflate_after_pause(speed, dt))
-    return state
+    # Two frames are never taken at once: one with the time of the frame before was taken up to an interval later.
+    late_s = drift_filter.interval_s if dt == 0.0 and frame.sample != state.sample else 0.0
+    reach = speed * max(late_s, state.late_s)
+    if reach > 0.0:
+        state = state.inflate(inflate_position(np.eye(2) * reach**2))
+    return replace(state, late_s=late_s)
 
 
 def _follow(
@@ -161,6 +181,9 @@ def _follow(
     settings, sample = setup.settings, frame.sample
     is_repeated = sample == state.sample
     state = replace(state, sample=sample)
+    flaw = _find_flaw(state, is_repeated=is_repeated)
+    if flaw is not None:
+        return coast(setup, state, frame, [RejectedMatch.unseen(flaw)], rescaled=False)
     candidates = state.keyframes.candidates(
         state.filter.state, frame, settings.rekey_overlap, settings.max_ratio
     )
@@ -177,10 +200,7 @@ def _follow(
     for candidate in candidates[: CANDIDATES if is_steady else 2 * CANDIDATES]:
         state, match = match_keyframe(setup, state, frame, candidate)
         if isinstance(match, Match) and is_repeated:
-            # Noise never comes twice: the scan is paused, or the driver sent the frame again.
-            reason = "image: the same as the previous frame"
-            repeated = Rejection(MatchFailure.REPEATED_IMAGE, reason)
-            match = RejectedMatch(repeated, match.registration)
+            match = RejectedMatch(_REPEATED_IMAGE, match.registration)
         if isinstance(match, Match):
             state, match = free_of_pull(setup, state, frame, match)
             state, refused = use_match(setup, state, frame, match)
@@ -189,6 +209,18 @@ def _follow(
             match = refused
         rejected.append(match)
     return coast(setup, state, frame, rejected, rescaled=candidates[0].rescaled)
+
+
+def _find_flaw(state: TrackerState, *, is_repeated: bool) -> Rejection[MatchFailure] | None:
+    """Why a frame is not used, whatever it shows; None where nothing speaks against it."""
+    if state.tears.share > 0.0:
+        share = 100.0 * state.tears.share
+        reason = f"image: torn: {share:.0f} % of its lines are those of the previous frame"
+        return Rejection(MatchFailure.REPEATED_IMAGE, reason)
+    if not state.filter.knows_motion:
+        # A frame at another time tells the prior of the motion; without any, a shift would be taken for noise.
+        return _REPEATED_IMAGE if is_repeated else _REPEATED_TIME
+    return None
 
 
 def _look_for_fixed(
@@ -253,7 +285,7 @@ def _conclude(state: TrackerState, frame: ScanFrame, raw: AnyImage, time_s: floa
         similarity=state.similarity.mark_frame(state.filter.state.time_s),
         camera=frame.camera,
         time_s=time_s,
-        static=state.static.keep(raw),
+        static=state.static if state.tears.share > 0.0 else state.static.keep(raw),
         lines=replace(state.lines, of_unseen=state.unseen_covariance(frame.px_from_unit)),
     )
 
@@ -319,10 +351,11 @@ class DriftTracker:
         image
             (h, w) or (h, w, 3) image of integers or floats.
         time_s
-            Start of its acquisition. A time before that of the last frame resets the tracker.
+            Start of its acquisition. A time before that of the last frame begins anew at zero drift, and the update
+            says ``restarted``.
         camera
             Camera of this frame's magnification; None tracks in raw pixels. A stream that gains or
-            loses its camera starts again, because its unit changes.
+            loses its camera begins anew, too, because its unit changes.
         timing
             Raster timing; None takes the frame as an instant at ``time_s``.
         rectified

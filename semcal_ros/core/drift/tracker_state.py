@@ -39,6 +39,7 @@ from semcal_ros.core.drift.own_motion import OwnMotionEstimator
 from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState, turn_drift
 from semcal_ros.core.drift.static_parts import StaticParts
+from semcal_ros.core.drift.torn_frames import TearTest
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.core.registration.failures import MatchFailure
@@ -80,6 +81,8 @@ class TrackerState:
         Those of the latest frame.
     sample
         Some of its pixels, by which an image that comes again is recognised.
+    late_s
+        By how much later than its time it may have been taken: an interval where the frame before has the same time.
     outliers
         The test of shifts that were not expected.
     rejected
@@ -91,6 +94,8 @@ class TrackerState:
         What did not move with the specimen in the last frame that matched, and what measures its motion.
     static
         What never moves.
+    tears
+        The test for frames of which a part is that of the frame before.
     lines
         What is known where lines alone are seen.
     flicker
@@ -103,12 +108,14 @@ class TrackerState:
     camera: ScanCamera | None
     time_s: float
     sample: bytes
+    late_s: float = 0.0
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
     moving: MovingTiles | None = None
     body: OwnMotionEstimator = field(default_factory=OwnMotionEstimator)
     static: StaticParts = field(default_factory=StaticParts)
+    tears: TearTest = field(default_factory=TearTest)
     lines: LinesOnly = field(default_factory=LinesOnly)
     flicker: FlickerEstimator = field(default_factory=FlickerEstimator)
 
@@ -118,6 +125,14 @@ class TrackerState:
         """
         has_same_unit = (self.camera is None) == (frame.camera is None)
         return time_s >= self.time_s and has_same_unit and len(self.keyframes) > 0
+
+    @property
+    def previous_s(self) -> float:
+        """Time of the frame before, seen from the one that is being followed: where both have the same, a typical
+        interval earlier.
+        """
+        now_s = self.filter.state.time_s
+        return self.time_s if now_s > self.time_s else now_s - self.filter.interval_s
 
     def unseen_covariance(self, px_from_unit: Array) -> Array:
         """(2, 2) covariance of the drift along lines, which has only been predicted since they alone are seen."""

@@ -26,8 +26,10 @@ class MatchFailure(Enum):
     UNUSABLE_REFERENCE = "unusable reference"
     #: The image is.
     UNUSABLE_IMAGE = "unusable image"
-    #: The image is the one before once more, down to its noise.
+    #: The image, or a part of it, is the one before once more, down to its noise.
     REPEATED_IMAGE = "repeated image"
+    #: It has the time of the one before.
+    REPEATED_TIME = "repeated time"
     #: No shift correlates clearly better than chance.
     NO_PEAK = "no peak"
     #: Several shifts explain the image equally well, or another one than was predicted does.
@@ -53,7 +55,9 @@ class MatchFailure(Enum):
 
 
 #: Failures of the image alone, which say nothing about the reference.
-IMAGE_FAILURES = frozenset({MatchFailure.UNUSABLE_IMAGE, MatchFailure.REPEATED_IMAGE})
+IMAGE_FAILURES = frozenset(
+    {MatchFailure.UNUSABLE_IMAGE, MatchFailure.REPEATED_IMAGE, MatchFailure.REPEATED_TIME}
+)
 
 #: Failures that stripes in the images may be the cause of.
 STRIPE_FAILURES = frozenset(
