@@ -362,7 +362,7 @@ def _fit_without_outliers(
             notes += own
             continue
         found = _find_masked_outlier(setup, fit) or find_outliers(
-            fit.adjustment.problem, fit.adjustment.result
+            fit.adjustment.problem, fit.adjustment.result, setup.priors.height_sigma_m
         )
         if not found:
             notes += _find_turned_axis(given, setup, fit)
@@ -465,11 +465,13 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
     lattice = fit.adjustment.spread.lattice_sigma
     if lattice is None or float(np.max(lattice)) < IRREGULAR_RATIO * usual:
         return {}
-    deviations = measure_deviations(fit.adjustment.problem, fit.adjustment.result)
+    deviations = measure_deviations(
+        fit.adjustment.problem, fit.adjustment.result, setup.priors.height_sigma_m
+    )
     count = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
     suspects = [
         int(v)
-        for v in np.argsort(-deviations.sigmas)[:SUSPECTS_MAX]
+        for v in np.argsort(-deviations.of_limit)[:SUSPECTS_MAX]
         if count[setup.views[int(v)].magnification] > 2
     ]
     left = {}
