@@ -46,7 +46,11 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_fac
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup, build_problem
 from semcal_ros.core.calibration.estimator.residual_field_fit import undo_field
-from semcal_ros.core.calibration.estimator.thresholds import MAGNIFICATIONS_MIN
+from semcal_ros.core.calibration.estimator.thresholds import (
+    MAGNIFICATIONS_MIN,
+    SPREAD_COUNT_MIN,
+    SPREAD_MAX,
+)
 from semcal_ros.core.calibration.judge import CalibrationResult, describe_fit, judge
 from semcal_ros.core.calibration.judgement.outliers import (
     find_outliers,
@@ -357,12 +361,17 @@ def _fit_without_outliers(
     while True:
         fit = fit_joint(setup, residual, on_stage)
         wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
-        if wrong:
+        found = _find_outlier_of_few(setup) if wrong or _is_irregular(setup, fit) else {}
+        if wrong and not found:
             setup, own = _without_tilts(setup, wrong)
             notes += own
             continue
-        found = _find_masked_outlier(setup, fit) or find_outliers(
-            fit.adjustment.problem, fit.adjustment.result
+        found = (
+            found
+            or _find_masked_outlier(setup, fit)
+            or find_outliers(
+                fit.adjustment.problem, fit.adjustment.result, setup.priors.height_sigma_m
+            )
         )
         if not found:
             notes += _find_turned_axis(given, setup, fit)
@@ -454,6 +463,46 @@ def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit
     ]
 
 
+def _is_irregular(setup: Setup, fit: JointFit) -> bool:
+    """Whether the views were given stretched grids."""
+    lattice = fit.adjustment.spread.lattice_sigma
+    usual = setup.priors.grid_stretch_sigma
+    return lattice is not None and float(np.max(lattice)) >= IRREGULAR_RATIO * usual
+
+
+def _find_outlier_of_few(setup: Setup) -> Mapping[int, Rejection[ViewStatus]]:
+    """Find the view of three that does not agree with the two others.
+
+    So few views do not widen the spread of heights, and tilts and grids take the place of a wrong scale. Here they are
+    given heights that can.
+
+    Raises
+    ------
+    CalibrationError
+        If there are two views, which do not agree: nothing tells which is wrong.
+    """
+    if not 1 < len(setup.views) < SPREAD_COUNT_MIN:
+        return {}
+    usual = setup.priors.height_sigma_m
+    priors = replace(setup.priors, height_sigma_m=SPREAD_MAX * usual)
+    try:
+        adjusted = fit_joint(replace(setup, priors=priors), "off").adjustment
+    except CalibrationError:
+        return {}
+    if len(setup.views) > 2:
+        return find_outliers(adjusted.problem, adjusted.result, usual)
+    found = measure_deviations(adjusted.problem, adjusted.result, usual)
+    if np.max(found.of_limit) < 1.0:
+        return {}
+    first, second = (f"{v.name} (at {v.magnification:g})" for v in setup.views)
+    apart_um = 1e6 * float(np.max(np.abs(found.height_m)))
+    raise CalibrationError(
+        f"views {first} and {second} that do not agree: their heights would differ by {apart_um:.0f} um",
+        expected="two views of one grid, at magnifications and with squares that are stated rightly",
+        do="check the magnifications and the squares of both, or record a third view, which tells which is wrong",
+    )
+
+
 def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[ViewStatus]]:
     """Find the one view without which the grid is regular.
 
@@ -461,15 +510,16 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
     all views are given stretched grids, and that view stands out little. Leaving it out makes the stretch of the
     others collapse, which leaving out another does not.
     """
-    usual = setup.priors.grid_stretch_sigma
     lattice = fit.adjustment.spread.lattice_sigma
-    if lattice is None or float(np.max(lattice)) < IRREGULAR_RATIO * usual:
+    if lattice is None or not _is_irregular(setup, fit):
         return {}
-    deviations = measure_deviations(fit.adjustment.problem, fit.adjustment.result)
+    deviations = measure_deviations(
+        fit.adjustment.problem, fit.adjustment.result, setup.priors.height_sigma_m
+    )
     count = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
     suspects = [
         int(v)
-        for v in np.argsort(-deviations.sigmas)[:SUSPECTS_MAX]
+        for v in np.argsort(-deviations.of_limit)[:SUSPECTS_MAX]
         if count[setup.views[int(v)].magnification] > 2
     ]
     left = {}

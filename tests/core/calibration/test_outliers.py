@@ -26,11 +26,20 @@ from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup
 from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
-from semcal_ros.core.calibration.judgement.outliers import find_change_point, find_outliers
+from semcal_ros.core.calibration.judgement.outliers import (
+    find_change_point,
+    find_outliers,
+    measure_deviations,
+)
+from semcal_ros.core.calibration.judgement.thresholds import OUTLIER_FALSE_ALARMS
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.views import ViewStatus
+from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_distortion import Raster
+from semcal_ros.core.errors import CalibrationError
+from semcal_ros.synthetic import preset
+from semcal_ros.synthetic.stage import SimulatedStage, stage_views
 from tests.helpers.calibrations import CALIBRATED, calibrated, seen_views
 
 OFF = CalibrationOptions(residual="off")
@@ -68,6 +77,61 @@ def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):
         clean = calibrate_views([v for i, v in enumerate(views) if i != wrong], **OPTIONS)
         for g in (500.0, 2600.0, 8000.0):
             np.testing.assert_allclose(result.model.at(g).m, clean.model.at(g).m, rtol=1e-6)
+
+
+@pytest.mark.long
+def test_of_four_views_the_one_of_other_squares_is_left_out():
+    views = seen_views("jsm820", (800.0,))
+    result = calibrate_views(_misnamed(views, 1, 2.0**0.5), **OPTIONS)
+    assert [o.name for o in result.outliers] == [views[1].name]
+    truth = preset("jsm820").camera_at(800.0).pixel_size_m[0]
+    camera = result.model.at(800.0)
+    # It was 7 % off, with as large a sigma.
+    assert camera.pixel_size_sigma_m[0] < 0.01 * truth
+    assert abs(camera.pixel_size_m[0] - truth) < 3.0 * camera.pixel_size_sigma_m[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("views", [2, 3, 4])
+def test_one_wrong_magnification_among_few_views_is_left_out(views):
+    """Of two magnifications with that many views each, one view at 300x states 700x."""
+    seen = seen_views("jsm820", (300.0, 800.0), views=views)
+    wrong = [replace(v, magnification=700.0) if i == 1 else v for i, v in enumerate(seen)]
+    result = calibrate_views(wrong, **OPTIONS)
+    assert [o.name for o in result.outliers] == [seen[1].name]
+    for g in (300.0, 800.0):
+        camera, truth = result.model.at(g), preset("jsm820").camera_at(g).pixel_size_m
+        assert np.all(np.array(camera.pixel_size_sigma_m) < 0.01 * np.array(truth))
+        error = np.array(camera.pixel_size_m) - truth
+        assert np.all(np.abs(error) < 3.0 * np.array(camera.pixel_size_sigma_m))
+
+
+def _of_stage(count):
+    """Views at 800x that know their tilts, of which the second shows squares that are larger by sqrt(2)."""
+    stage = SimulatedStage(tilts_rad=(0.0, 0.35, 0.6)[:count])
+    views = stage_views(
+        preset("jsm820").camera_at, (800.0,), stage, readings=True, most_corners=130
+    )
+    return _misnamed(views, 1, 2.0**0.5)
+
+
+@pytest.mark.long
+def test_of_three_views_the_one_of_other_squares_is_left_out():
+    """Few views do not widen the spread of heights: tilts and grids would take the place of the scale."""
+    views = _of_stage(3)
+    result = calibrate_views(views, **OPTIONS)
+    assert [o.name for o in result.outliers] == [views[1].name]
+    camera, truth = result.model.at(800.0), preset("jsm820").camera_at(800.0).pixel_size_m
+    error = np.array(camera.pixel_size_m) - truth
+    assert np.all(np.abs(error) < 3.0 * np.array(camera.pixel_size_sigma_m))
+
+
+@pytest.mark.slow
+def test_of_two_views_that_do_not_agree_none_is_believed():
+    views = _of_stage(2)
+    names = f"{views[0].name} .*{views[1].name} .*"
+    with pytest.raises(CalibrationError, match=f"{names}do not agree.*record a third view"):
+        calibrate_views(views, **OPTIONS)
 
 
 @pytest.mark.slow
@@ -195,6 +259,60 @@ def test_where_half_of_a_magnification_disagrees_no_single_view_is_at_fault():
     # Nor where many disagree in all.
     residual[[5, 12, 20]] = 10.0
     assert not find_outliers(*_adjusted(group, residual))
+
+
+@pytest.mark.parametrize("count", [3, 4, 6, 8, 16])
+def test_a_view_has_no_part_in_the_spread_by_which_it_is_judged(count):
+    """Of up to eight views, one that is off would else never be far off in spreads."""
+    heights = 2e-6 * np.cos(np.arange(count))
+    heights[1] += 2.5e-3
+    group = np.zeros(count, dtype=int)
+    assert list(find_outliers(*_adjusted(group, 1.0, heights_m=heights))) == [1]
+
+
+def test_of_two_views_that_disagree_neither_is_chosen():
+    heights = np.array([0.0, 5e-3])
+    adjusted = _adjusted([0, 0], 1.0, heights_m=heights)
+    assert np.all(measure_deviations(*adjusted).of_limit > 1.0)
+    assert not find_outliers(*adjusted)
+    # Nor of two pairs.
+    assert not find_outliers(*_adjusted([0] * 4, 1.0, heights_m=np.repeat(heights, 2)))
+
+
+@pytest.mark.parametrize(("height_m", "odd"), [(0.5e-3, False), (1.2e-3, True)])
+def test_a_tilted_view_is_not_judged_by_still_ones(height_m, odd):
+    """A stage moves where it tilts: views from above that agree to a micrometre do not say by how much."""
+    heights = np.array([0.0, 1e-6, -1e-6, 0.5e-6, 0.0, height_m])
+    problem, result = _adjusted([0] * 6, 1.0, heights_m=heights)
+    rotations = result.state.rotations.copy()
+    rotations[-1] = rotations_from_vectors(np.array([[0.6, 0.0, 0.0]]))[0]
+    tilted = replace(result, state=replace(result.state, rotations=rotations))
+    assert list(find_outliers(problem, tilted)) == ([5] if odd else [])
+    # Among other views from above it would be an outlier.
+    assert list(find_outliers(problem, result)) == [5]
+
+
+@pytest.mark.parametrize(
+    ("count", "sigma_m"),
+    [
+        (3, 1e-5),
+        (3, 1e-4),
+        (4, 1e-5),
+        (4, 1.35e-4),
+        (6, 1.35e-4),
+        (16, 1e-5),
+        (16, 1e-4),
+        (16, 1e-3),
+    ],
+)
+def test_sound_views_are_left_out_in_one_recording_of_a_hundred_at_most(count, sigma_m):
+    """Normal heights, of few views up to what is usual with what it is uncertain by, of many of any spread."""
+    rng = np.random.default_rng((7, count))
+    recordings, lost = 100, 0
+    for _ in range(recordings):
+        heights = rng.normal(0.0, sigma_m, count)
+        lost += bool(find_outliers(*_adjusted([0] * count, 1.0, heights_m=heights)))
+    assert lost <= recordings * OUTLIER_FALSE_ALARMS
 
 
 @pytest.mark.long

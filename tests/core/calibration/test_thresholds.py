@@ -37,7 +37,7 @@ from semcal_ros.core.calibration.judgement.check import CHANGES
         (2.0 * stats.norm.sf(judgement.TILT_SIGMAS), 1.7e6),
         (2.0 * stats.norm.sf(judgement.SURPRISING_SIGMAS), 16_000),
         (10.0 * 2.0 * stats.norm.sf(judgement.DIFFERENT_SIGMAS), 100),
-        (2.0 * stats.norm.sf(judgement.WRONG_QUANTILE_SIGMAS), 1.0 / judgement.WRONG_PART_MAX),
+        (judgement.OUTLIER_FALSE_ALARMS, 100),
         (2.0 * stats.norm.sf((t.MISFIT_MAX - 1.0) / judgement.MISFIT_SIGMA), 370),
         (stats.chi2.sf(2.0 * t.TERM_GAIN, 1), 640),
         (stats.chi2.sf(estimator.JITTER_GAIN, 1), 370),
@@ -53,6 +53,7 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
     [
         (1.0 - math.cos(estimator.FLAT_RAD), 0.004, 2e-4),
         (1.0 / math.sqrt(2.0 * estimator.SPREAD_COUNT_MIN), 0.35, 0.005),
+        (1.0 / math.sqrt(2.0 * judgement.USUAL_VIEWS), 0.35, 0.005),
         (1.0 / math.sqrt(2.0 * 100.0), 0.07, 0.001),
         (math.sqrt(2.0 * estimator.NOTHING_DECREASE), 0.0045, 5e-5),
         (estimator.ALONG_LINE_MIN, math.cos(math.radians(45.0)) ** 2, 1e-12),

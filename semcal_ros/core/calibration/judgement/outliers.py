@@ -37,19 +37,21 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     refine,
     variance_factor,
 )
-from semcal_ros.core.calibration.estimator.problem import Setup
+from semcal_ros.core.calibration.estimator.problem import Priors, Setup
 from semcal_ros.core.calibration.estimator.residuals import whitened_norm
+from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD
 from semcal_ros.core.calibration.judgement.thresholds import (
     DETERMINED_MIN,
     HEIGHT_SIGMAS,
     HEIGHT_SPREAD_MIN_M,
     JUMP_FALSE_ALARMS,
     MISFIT_RATIO,
+    OUTLIER_FALSE_ALARMS,
     SHAPE_SPREAD_MIN,
     TILT_SIGMAS,
+    USUAL_VIEWS,
     VIEWS_MIN,
     WRONG_PART_MAX,
-    WRONG_QUANTILE_SIGMAS,
 )
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
@@ -147,58 +149,104 @@ class Deviations:
     Attributes
     ----------
     height_m, stretch, misfit
-        (V,) height about that of the views at its magnification, m; the larger of stretch and shear of
+        (V,) height about that of the other views at its magnification, m; the larger of stretch and shear of
         its lattice; RMS residual over that of the median view.
-    usual_height_m
-        Robust 1-sigma of the heights, m.
-    sigmas
-        (V,) deviation of height and stretch together, in robust standard deviations. A wrong scale is
-        imitated by both in part, as the projection lets it.
+    others_height_m
+        (V,) RMS of such heights among the views with which it is compared, m.
+    of_limit
+        (V,) deviation of height and stretch together, over the limit for it. A wrong scale is imitated by both in
+        part, as the projection lets it.
     """
 
     height_m: Array
     stretch: Array
     misfit: Array
-    usual_height_m: float
-    sigmas: Array
+    others_height_m: Array
+    of_limit: Array
 
     def reject(self, view: int) -> Rejection[ViewStatus]:
         """Return why a view is left out."""
         return Rejection(
             ViewStatus.OUTLIER,
-            f"does not agree with the other views at its magnification: {1e6 * self.height_m[view]:.0f} um of height, "
-            f"where {1e6 * self.usual_height_m:.0f} um are usual, a grid stretched by "
+            f"does not agree with the other views: {1e6 * self.height_m[view]:.0f} um of height, where the others "
+            f"scatter by {1e6 * self.others_height_m[view]:.0f} um, a grid stretched by "
             f"{100.0 * self.stretch[view]:.2g} %, and residuals {self.misfit[view]:.1f} times the usual; wrong "
             "magnification, or a wrong square size",
         )
 
 
-def measure_deviations(problem: Problem, result: BundleResult) -> Deviations:
-    """Measure how much each view disagrees with the others; ``problem`` and ``result`` are the adjustment."""
-    height = result.state.translations_m[:, 2]
+def measure_deviations(
+    problem: Problem, result: BundleResult, usual_height_m: float = Priors.height_sigma_m
+) -> Deviations:
+    """Measure how much each view disagrees with the others; ``problem`` and ``result`` are the adjustment.
+
+    A view has no part in what it is compared with: where there are few, it would rule their spread. Heights scatter
+    where the stage moves, so that a tilted view is compared with tilted ones, and ``usual_height_m`` is their usual
+    1-sigma.
+    """
+    count = len(problem.group)
     square = np.add.reduceat(
         whitened_norm(problem, result.residuals_px) ** 2, problem.starts[:-1]
     ) / np.diff(problem.starts)
     misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
-    offset = height - np.median(height)
+    tilted = result.state.rotations[:, 2, 2] <= np.cos(FLAT_RAD)
+    lattices = np.abs(result.state.lattices)
+    stretch = np.max(lattices, axis=1) if len(lattices) else np.zeros(count)
+    height, others = np.zeros(count), np.zeros(count)
+    of_limit = np.zeros(count)
+    for v in range(count):
+        rest = np.arange(count) != v
+        heights, from_views = _heights_without(problem, result.state.translations_m[:, 2], v)
+        like = heights[rest & (tilted | ~tilted[v])]
+        limit, others[v] = _limit(like, from_views, count, usual_height_m, HEIGHT_SPREAD_MIN_M)
+        height[v] = heights[v]
+        of_limit[v] = abs(height[v]) / limit
+        if len(lattices):
+            bend, _ = _limit(stretch[rest], count - 1, count, SHAPE_SPREAD_MIN, SHAPE_SPREAD_MIN)
+            of_limit[v] = np.hypot(of_limit[v], stretch[v] / bend)
+    return Deviations(height, stretch, misfit, others, of_limit)
+
+
+def _heights_without(problem: Problem, height: Array, view: int) -> tuple[Array, int]:
+    """Return the (V,) heights about the medians of the others, and of how many views that of ``view`` is the median."""
+    rest = np.arange(len(height)) != view
+    offset = height - np.median(height[rest]) if np.any(rest) else np.zeros(len(height))
+    from_views = int(rest.sum())
     for own in _members(problem):
         if len(own) >= VIEWS_MIN:
-            offset[own] = height[own] - np.median(height[own])
-    # The median would only reflect the views with a still stage.
-    spread = max(
-        float(np.quantile(np.abs(offset), 1.0 - WRONG_PART_MAX)) / WRONG_QUANTILE_SIGMAS,
-        HEIGHT_SPREAD_MIN_M,
-    )
-    sigmas = np.abs(offset) / spread
-    stretch = np.zeros(len(height))
-    if len(result.state.lattices):
-        stretch = np.max(np.abs(result.state.lattices), axis=1)
-        usual = max(
-            float(np.quantile(stretch, 1.0 - WRONG_PART_MAX)) / WRONG_QUANTILE_SIGMAS,
-            SHAPE_SPREAD_MIN,
-        )
-        sigmas = np.hypot(sigmas, stretch / usual)
-    return Deviations(offset, stretch, misfit, spread, sigmas)
+            offset[own] = height[own] - np.median(height[own[rest[own]]])
+            if view in own:
+                from_views = len(own) - 1
+    return offset, from_views
+
+
+def _limit(
+    others: Array, from_views: int, count: int, usual: float, least: float
+) -> tuple[float, float]:
+    """Return the deviation from the others from which a view is odd, and the RMS deviation of the others.
+
+    The spread is that of the others alone, or together with :data:`USUAL_VIEWS` that have the ``usual`` one, whichever
+    lets more be seen: the first says much where there are many, the second where there are few. Each gets half of the
+    chance :data:`OUTLIER_FALSE_ALARMS`, shared among the ``count`` views by Bonferroni's inequality; a deviation over
+    a spread that is known from few is Student's t. The median of others is uncertain itself, of normal ones by
+    sqrt(pi / 2) of what their mean is. Where there are many views, as many may be wrong as are left out at once, and
+    the spread is that without them (Rosner 1983, doi:10.1080/00401706.1983.10487848).
+    """
+    wrong = max(int(WRONG_PART_MAX * count), 1)
+    squares = np.sort(others**2)[: max(len(others) - wrong + 1, 1)]
+    freedom = max(len(squares) - 1, 0)
+    total = float(np.sum(squares))
+    chance = 0.25 * OUTLIER_FALSE_ALARMS / count
+    wider = np.sqrt(1.0 + 0.5 * np.pi / max(from_views, 1))
+    limits = []
+    for known, square in (
+        (freedom, total),
+        (freedom + USUAL_VIEWS, total + USUAL_VIEWS * usual**2),
+    ):
+        if known > 0:
+            sigmas = max(HEIGHT_SIGMAS, -wider * float(stdtrit(known, chance)))
+            limits.append(sigmas * max(float(np.sqrt(square / known)), least))
+    return min(limits), float(np.sqrt(total / max(len(squares), 1)))
 
 
 def _members(problem: Problem) -> list[Indices]:
@@ -206,16 +254,18 @@ def _members(problem: Problem) -> list[Indices]:
     return [np.flatnonzero(problem.group == k) for k in range(len(problem.designs))]
 
 
-def find_outliers(problem: Problem, result: BundleResult) -> Mapping[int, Rejection[ViewStatus]]:
+def find_outliers(
+    problem: Problem, result: BundleResult, usual_height_m: float = Priors.height_sigma_m
+) -> Mapping[int, Rejection[ViewStatus]]:
     """Find the views that disagree with the others; index and reason of each.
 
-    ``problem`` and ``result`` are the adjustment. Where half of the views at a magnification
-    disagree, or many in all, the fault is not in single views, and none is returned.
+    ``problem`` and ``result`` are the adjustment, ``usual_height_m`` is as for :func:`measure_deviations`. Where half
+    of the views at a magnification disagree, or many in all, the fault is not in single views, and none is returned.
     """
-    found = measure_deviations(problem, result)
-    odd = (found.sigmas > HEIGHT_SIGMAS) | (found.misfit > MISFIT_RATIO)
+    found = measure_deviations(problem, result, usual_height_m)
+    odd = (found.of_limit > 1.0) | (found.misfit > MISFIT_RATIO)
     outliers: dict[int, Rejection[ViewStatus]] = {}
-    if odd.mean() > WRONG_PART_MAX:
+    if odd.sum() > max(1.0, WRONG_PART_MAX * len(odd)) or 2 * odd.sum() >= len(odd):
         return outliers
     for own in _members(problem):
         if len(own) >= VIEWS_MIN and 2 * odd[own].sum() >= len(own):
