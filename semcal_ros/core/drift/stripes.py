@@ -63,6 +63,9 @@ class Stripes:
     def __bool__(self) -> bool:
         return self.lines or self.columns
 
+    def __and__(self, other: Stripes) -> Stripes:
+        return Stripes(self.lines and other.lines, self.columns and other.columns)
+
     def __or__(self, other: Stripes) -> Stripes:
         return Stripes(self.lines or other.lines, self.columns or other.columns)
 

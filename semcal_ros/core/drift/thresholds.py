@@ -926,5 +926,5 @@ STRIPE_TRIES = TABLE.cost(
 )
 STRIPE_CHI2_MIN = TABLE.derived(
     "STRIPE_CHI2_MIN", 25.0, "squared deviations",
-    "Between the shifts with and without stripes: by chance one pair in 270,000 (chi-square of two numbers).",
+    "Along one axis, between the shifts with and without stripes: by chance one in 1.7 million (normal, both sides).",
 )

@@ -52,6 +52,8 @@ from semcal_ros.core.drift.remade_keyframes import clean_keyframes
 from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState
 from semcal_ros.core.drift.state import initial_state
+from semcal_ros.core.drift.static_parts import StaticParts
+from semcal_ros.core.drift.stripes import Stripes
 from semcal_ros.core.drift.thresholds import (
     CANDIDATES,
     PAUSE_MIN,
@@ -262,19 +264,33 @@ def _follow_without_stripes(
     static = state.static.suspect_stripes(raw, least) if looks else state.static
     if static.stripes == state.static.stripes:
         return found
-    frame = static.remove_from(replace(found[2], image=raw))
-    cleaned = clean_keyframes(setup, replace(state, static=static))
+    cleaned, frame = _without(setup, state, static, replace(found[2], image=raw))
     freed, without = _follow(setup, cleaned, frame)
     if not without.accepted or without.along is not None:
         return found
-    if rejection is None:
-        apart = without.drift_m - with_them.drift_m
-        if float(apart @ np.linalg.solve(without.covariance[:2, :2], apart)) < STRIPE_CHI2_MIN:
-            return found
-        # The frames before were pulled as well.
-        widened = cleaned.filter.widen_measurements(np.outer(apart, apart))
-        freed, without = _follow(setup, replace(cleaned, filter=widened), frame)
+    if rejection is not None:
+        return freed, without, frame
+    # Lines pull along y, and columns along x.
+    to_px = frame.px_from_unit
+    apart = without.drift_m - with_them.drift_m
+    squares = (to_px @ apart) ** 2 / np.diag(to_px @ without.covariance[:2, :2] @ to_px.T)
+    pulled = Stripes(*(squares[::-1] > STRIPE_CHI2_MIN).tolist()) & static.stripes
+    known = state.static.stripes
+    if known | pulled == known:
+        return found
+    static = replace(static, stripes=known | pulled)
+    cleaned, frame = _without(setup, state, static, replace(found[2], image=raw))
+    # The frames before were pulled as well.
+    widened = cleaned.filter.widen_measurements(np.outer(apart, apart))
+    freed, without = _follow(setup, replace(cleaned, filter=widened), frame)
     return freed, without, frame
+
+
+def _without(
+    setup: TrackerSetup, state: TrackerState, static: StaticParts, frame: ScanFrame
+) -> tuple[TrackerState, ScanFrame]:
+    """The state with keyframes that are free of what is ``static``, and such a frame, which came with all of it."""
+    return clean_keyframes(setup, replace(state, static=static)), static.remove_from(frame)
 
 
 def _conclude(state: TrackerState, frame: ScanFrame, raw: AnyImage, time_s: float) -> TrackerState:
