@@ -260,4 +260,8 @@ def resampleable(image: AnyImage) -> AnyImage:
         If it is not an image.
     """
     pixels = check_image(image)
-    return pixels if pixels.dtype.name in RESAMPLED_TYPES else pixels.astype(np.float32)
+    if pixels.dtype.name in RESAMPLED_TYPES:
+        return pixels
+    # What a float of 32 bits cannot hold becomes infinite, and is refused as that.
+    with np.errstate(over="ignore"):
+        return pixels.astype(np.float32)

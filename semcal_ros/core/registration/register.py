@@ -76,6 +76,7 @@ from semcal_ros.core.registration.thresholds import (
     DROPPED_MAX,
     DROPPED_WITHIN_PX,
     FARTHER_PX,
+    GREY_LEVEL_MAX,
     LEVEL_PX_MIN,
     PARTS_SIGNAL_MIN,
     PULL_PX_MAX,
@@ -203,9 +204,12 @@ def _find_defect(gray: AnyImage) -> str:
     """Why an image alone cannot be registered, or an empty string."""
     if min(gray.shape) < SIDE_PX_MIN:
         return f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
-    if gray.dtype.kind == "f" and not np.isfinite(np.sum(gray, dtype=np.float64)):
-        return "values that are not finite"
     lowest, highest = gray.min(), gray.max()
+    if gray.dtype.kind == "f":
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
+            return "values that are not finite"
+        if max(-lowest, highest) > GREY_LEVEL_MAX:
+            return f"values beyond {GREY_LEVEL_MAX:g}"
     return f"blank (all pixels at {highest:g})" if lowest == highest else ""
 
 

@@ -90,6 +90,10 @@ TEXTURE_PX_MIN = TABLE.stated(
     "TEXTURE_PX_MIN", 16, "px",
     "Side of the part in which noise and structure are measured: its spectrum has three coefficients to a ring.",
 )
+GREY_LEVEL_MAX = TABLE.derived(
+    "GREY_LEVEL_MAX", 1e15, "grey levels",
+    "Of an image of floats: the sum of the squares of 10^8 pixels is a float of 32 bits, which ends at 3.4e38.",
+)
 LEVEL_PX_MIN = TABLE.derived(
     "LEVEL_PX_MIN", 160, "px",
     "Of a reduced image: it leaves 24 tiles of the least side, 6 px, along each side between the margins of the "

@@ -351,6 +351,31 @@ def test_bad_input_is_refused() -> None:
         DriftSettings(rekey_overlap=1.5)
 
 
+@pytest.mark.parametrize(
+    ("level", "reason"),
+    [
+        (1e16, "values beyond 1e+15"),
+        (1e30, "values beyond 1e+15"),
+        (1e40, "values that are not finite"),
+    ],
+)
+def test_values_whose_squares_overflow_are_refused_and_spoil_nothing(
+    level: float, reason: str
+) -> None:
+    texture = Texture(seed=4, n=256)
+    frames = [noisy(texture.view((0.6 * k, 0.0), 128), 4.0, k) for k in range(4)]
+    hot = frames[2].copy()
+    hot[5, 7] = -level
+    for spoilt in (frames[2] * level, hot):
+        tracker = DriftTracker()
+        given = [frames[0], frames[1], spoilt, frames[3]]
+        said = [tracker.update(image, float(k)).status_text for k, image in enumerate(given)]
+        assert said == ["keyframe", "tracked", f"coasting: image: {reason}", "tracked"]
+    first = DriftTracker()
+    assert first.update(frames[0] * level, 0.0).status_text == f"coasting: {reason}"
+    assert first.update(frames[1], 1.0).status_text == "keyframe"
+
+
 def _gold() -> Path:
     root = os.environ.get("SEMCAL_REFERENCE_DATA")
     if not root:
