@@ -201,7 +201,8 @@ def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) ->
     return [
         Finding(
             f"scale: {refused} of {counted(len(stated), 'view')} contradict the tilt of the stage: the stage is not "
-            "used; check the unit of its angles, and its stamps"
+            "used; check the unit of its angles, its rotation, its stamps, and the direction of its tilt axis "
+            "(stage.tilt_axis_deg)"
         )
     ]
 

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -31,12 +32,13 @@ from semcal_ros.core.calibration.estimator.posterior import CovarianceParts, cer
 from semcal_ros.core.calibration.estimator.problem import Functions, Setup
 from semcal_ros.core.calibration.estimator.residual_field_fit import FittedField
 from semcal_ros.core.calibration.judgement.evaluate import ViewPose, fit_poses, rms_by_magnification
-from semcal_ros.core.calibration.judgement.outliers import find_change_point
+from semcal_ros.core.calibration.judgement.outliers import ChangePoint, find_change_point
 from semcal_ros.core.calibration.judgement.scale_checks import (
     estimate_repeatability,
     find_scale_weaknesses,
     measure_excess,
 )
+from semcal_ros.core.calibration.judgement.thresholds import VIEWS_MIN
 from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model, rank_findings
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.solve import JointFit, without_magnification
@@ -212,6 +214,16 @@ class CalibrationResult:
         return tuple(own.sentence(self.model) for own in rank_findings(self.findings, self.model))
 
 
+def _name_few_beside(setup: Setup, change: ChangePoint) -> str:
+    """Return that the few views beside a jump may have a wrong magnification, or nothing if they are not few."""
+    counts = Counter(v.magnification for v in setup.views)
+    least = min((change.below, change.above), key=lambda g: counts[g])
+    if counts[least] >= min(VIEWS_MIN, float(np.median(list(counts.values())))):
+        return ""
+    names = " and ".join(v.name for v in setup.views if v.magnification == least)
+    return f"look first whether {names} was taken at {least:g}, where there are fewer views than elsewhere; else, "
+
+
 def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     """Return the joint fit as that of any method, with what is to be said of it."""
     adjustment, result = fit.adjustment, fit.adjustment.result
@@ -237,8 +249,8 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
         findings.append(
             Finding(
                 f"the scale seems to jump by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} % between "
-                f"magnifications {change.below:g} and {change.above:g}: if the microscope switches its scan range "
-                "there, calibrate with this breakpoint",
+                f"magnifications {change.below:g} and {change.above:g}: {_name_few_beside(setup, change)}if the "
+                "microscope switches its scan range there, calibrate with this breakpoint",
                 # A smooth curve through a jump is off by half of it on either side.
                 cost_relative=0.5 * change.relative,
                 magnification=change.below,

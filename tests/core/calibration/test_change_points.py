@@ -63,6 +63,21 @@ def test_a_jump_is_suspected_and_said_but_not_applied():
 
 
 @pytest.mark.long
+def test_the_one_view_beside_a_jump_may_have_a_wrong_magnification():
+    """One of four views at 300x states 315x: the jump of 5 % is that entry."""
+    views = grid_views(MICROSCOPE.camera_at, [300.0, 800.0], noise_px=0.05, views=4, seed=2)
+    views[1] = replace(views[1], magnification=315.0)
+    result = calibrate_views(
+        views,
+        image_size=MICROSCOPE.image_size,
+        display_width_m=0.12,
+        options=CalibrationOptions(residual="off"),
+    )
+    (told,) = [w for w in result.warnings if "jump" in w]
+    assert f"look first whether {views[1].name} was taken at 315," in told
+
+
+@pytest.mark.long
 def test_a_smooth_microscope_is_not_suspected():
     smooth = calibrated("jsm820", CalibrationOptions(residual="off"))
     assert not any("jump" in w for w in smooth.warnings)

@@ -29,11 +29,13 @@ from semcal_ros.core.calibration.estimator.trust_region import DescentStatus
 from semcal_ros.core.calibration.judgement.outliers import (
     find_change_point,
     find_outliers,
+    find_wrong_tilts,
     measure_deviations,
 )
 from semcal_ros.core.calibration.judgement.thresholds import OUTLIER_FALSE_ALARMS
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
+from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.camera.plane_geometry import rotations_from_vectors
 from semcal_ros.core.camera.scan_distortion import Raster
@@ -313,6 +315,18 @@ def test_sound_views_are_left_out_in_one_recording_of_a_hundred_at_most(count, s
         heights = rng.normal(0.0, sigma_m, count)
         lost += bool(find_outliers(*_adjusted([0] * count, 1.0, heights_m=heights)))
     assert lost <= recordings * OUTLIER_FALSE_ALARMS
+
+
+def test_the_worst_of_the_tilts_that_contradict_the_stage_comes_first():
+    """One wrong reading moves the others with it, and is named in the message."""
+    problem, result = _adjusted([0] * 4, 1.0)
+    stage = attitudes([None] * 4, [True] * 4, StageAxis(), 0.01)
+    left = np.zeros((4, 3))
+    left[:, 0] = [9.4, 29.0, -32.0, -9.8]
+    told = {"prior_residuals": {"attitude": left}, "prior_variance": {"attitude": 0.0 * left}}
+    found = find_wrong_tilts(replace(problem, attitudes=stage), replace(result, **told))
+    assert list(found) == [2, 1]
+    assert not find_wrong_tilts(problem, result)
 
 
 @pytest.mark.long

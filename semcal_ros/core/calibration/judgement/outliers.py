@@ -128,7 +128,7 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
 
 
 def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, float]:
-    """Find the views whose tilt contradicts the stage; index and contradiction in sigmas of each.
+    """Find the views whose tilt contradicts the stage; index and contradiction in sigmas of each, the worst first.
 
     One wrong reading moves the constant offsets, and with them all the others: only those that are
     at least half as wrong as the worst are returned.
@@ -139,7 +139,8 @@ def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, flo
     free = np.maximum(1.0 - result.prior_variance["attitude"], DETERMINED_MIN)
     deviation = np.max(np.abs(left) / np.sqrt(free), axis=1)
     limit = max(TILT_SIGMAS, 0.5 * float(deviation.max()))
-    return {int(v): float(deviation[v]) for v in np.flatnonzero(deviation > limit)}
+    worst = np.argsort(-deviation)
+    return {int(v): float(deviation[v]) for v in worst if deviation[v] > limit}
 
 
 @dataclass(frozen=True, eq=False)
