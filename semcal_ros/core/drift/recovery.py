@@ -94,6 +94,13 @@ def _doubt(
     if disputed is not None:
         return disputed
     best = rejected[0]
+    suggested = np.asarray(np.linalg.solve(frame.px_from_unit, best.registration.suggested_px))
+    contradicted = inflate_if_contradicted(
+        state.filter.state, state.keyframes.current, suggested, INTERVAL_S_MIN
+    )
+    if contradicted is not None:
+        # It is not believed, but the prediction may be the one that is wrong.
+        return contradicted.covariance[:2, :2]
     if best.rejection.status not in _ELSEWHERE:
         return None
     if best.rejection.status is MatchFailure.NO_PEAK:

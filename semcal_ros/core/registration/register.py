@@ -127,6 +127,9 @@ class Registration:
     along
         (2,) the direction of lines along which the shift is the predicted one, since they do not tell it, and its
         covariance means nothing; None where both directions are measured.
+    suggested_px
+        (2,) the shift with which most of a rejected image agrees, where it may be that of something else; NaN
+        otherwise.
     """
 
     alignment: Alignment
@@ -137,6 +140,7 @@ class Registration:
     share: float = 1.0
     along: Array | None = None
     contrast: float = float("nan")
+    suggested_px: Array = field(default_factory=lambda: np.full(2, np.nan))
 
     _middle_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
     _origin_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
@@ -611,7 +615,8 @@ def _register(
         moving = replace(moving, corner_px=moving.corner_px + np.array(inside[:2]))
     if isinstance(alignment, Rejection):
         named = _name_deformation(alignment, reference, pyramid)
-        return Registration(unmeasured_alignment(), float("nan"), named)
+        suggested = np.array(peak.shift_px) + origin if kept is not None else np.full(2, np.nan)
+        return Registration(unmeasured_alignment(), float("nan"), named, suggested_px=suggested)
     signals = _measure_signals(reference, image_noise, alignment)
     correlation = signals.correlation
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
@@ -629,10 +634,12 @@ def _register(
     )
     height, width = np.shape(image)[:2]
     middle = 0.5 * (np.array([width, height]) - np.add(inside[:2], inside[2:]))
+    is_apart = rejection is not None and rejection.status is MatchFailure.STAGES_DISAGREE
     return Registration(
         moved,
         correlation,
         rejection,
+        suggested_px=moved.shift_px if is_apart else np.full(2, np.nan),
         moving=moving,
         share=share,
         contrast=signals.contrast,

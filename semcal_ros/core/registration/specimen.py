@@ -91,7 +91,8 @@ def keep_specimen(
     follow_px: Region | None = None,
     suspected: MovingTiles | None = None,
 ) -> tuple[Alignment | Rejection[MatchFailure], CoarsePeak, MovingTiles | None, float] | None:
-    """The alignment of the specimen alone where not all of the image moves with it; None where all does.
+    """The alignment of the specimen alone where not all of the image moves with it; None where all does. Where it is
+    ambiguous, the peak is at the shift with which most agrees.
 
     What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part; ``suspected`` is
     where something moved otherwise in the image before.
@@ -152,7 +153,9 @@ def keep_specimen(
     else:
         best = _choose_hypothesis(found, guess, spread)
     if isinstance(best, Rejection):
-        return best, peak, None, 0.0
+        most = max(found, key=lambda h: h.agreement.share)
+        x, y = most.alignment.shift_px.tolist()
+        return best, replace(most.start, shift_px=(x, y)), None, 0.0
     moving = find_moving(reference, best.alignment, best.agreement)
     share = best.agreement.share
     if follow_px is not None:

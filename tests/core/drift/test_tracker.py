@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.estimates import DriftUpdate
@@ -552,3 +553,21 @@ def test_a_place_that_was_doubted_and_found_again_is_certain_with_hindsight() ->
     assert np.sqrt(updates[8].covariance[0, 0]) > 30.0
     assert np.sqrt(updates[9].covariance[0, 0]) < 0.1
     assert history.smooth().sigma_m[8, 0] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "jump_px", "said"),
+    [("tool over gold", 8.0, "ambiguous"), ("two tools", 3.0, "coarse and fine shift differ")],
+)
+def test_a_stage_that_jumps_under_a_tool_is_not_denied_by_the_sigma(
+    kind: str, jump_px: float, said: str
+) -> None:
+    """What most of the image agrees with is not believed, but the prediction may be the one that is wrong."""
+    frames, drift, _ = draw(replace(KINDS[kind], jump_px=jump_px), 300)
+    tracker, coasted = DriftTracker(), 0
+    for k, (frame, at) in enumerate(zip(frames, drift, strict=True)):
+        update = tracker.update(frame, float(k))
+        coasted += said in update.reason
+        off = np.abs(update.drift_px - at)
+        assert np.all((off < 0.1) | (off < 3.0 * update.sigma_px)), (k, update.reason)
+    assert coasted >= 1 and update.accepted
