@@ -243,6 +243,17 @@ def test_heights_that_differ_by_micrometres_are_alike_however_small_the_spread(h
     assert list(found) == ([9] if odd else [])
 
 
+def test_heights_that_only_some_magnifications_tell_do_not_make_one_of_them_odd():
+    """Where the projection is parallel, the prior holds them: their spread is not that of the others."""
+    group = np.repeat(np.arange(4), [14, 6, 6, 6])
+    heights = np.where(np.arange(32) % 2, -1.0, 1.0) * np.where(group == 0, 22e-6, 1e-6)
+    heights[1] = -128e-6
+    assert not find_outliers(*_adjusted(group, 1.0, heights_m=heights))
+    # A millimetre is odd all the same.
+    heights[1] = -1e-3
+    assert list(find_outliers(*_adjusted(group, 1.0, heights_m=heights))) == [1]
+
+
 @pytest.mark.parametrize(("times", "odd"), [(5.0, False), (7.0, True)])
 def test_a_view_that_fits_much_worse_than_the_others_is_an_outlier(times, odd):
     residual = np.ones(24)

@@ -38,6 +38,7 @@ from semcal_ros.core.calibration.judgement.check import CHANGES
         (2.0 * stats.norm.sf(judgement.SURPRISING_SIGMAS), 16_000),
         (10.0 * 2.0 * stats.norm.sf(judgement.DIFFERENT_SIGMAS), 100),
         (judgement.OUTLIER_FALSE_ALARMS, 100),
+        (2.0 * stats.norm.sf(judgement.WRONG_QUANTILE_SIGMAS), 1.0 / judgement.WRONG_PART_MAX),
         (2.0 * stats.norm.sf((t.MISFIT_MAX - 1.0) / judgement.MISFIT_SIGMA), 370),
         (stats.chi2.sf(2.0 * t.TERM_GAIN, 1), 640),
         (stats.chi2.sf(estimator.JITTER_GAIN, 1), 370),

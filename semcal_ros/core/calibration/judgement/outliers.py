@@ -52,6 +52,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     USUAL_VIEWS,
     VIEWS_MIN,
     WRONG_PART_MAX,
+    WRONG_QUANTILE_SIGMAS,
 )
 from semcal_ros.core.calibration.views import ViewStatus
 from semcal_ros.core.errors import Rejection
@@ -231,12 +232,17 @@ def _limit(
     chance :data:`OUTLIER_FALSE_ALARMS`, shared among the ``count`` views by Bonferroni's inequality; a deviation over
     a spread that is known from few is Student's t. The median of others is uncertain itself, of normal ones by
     sqrt(pi / 2) of what their mean is. Where there are many views, as many may be wrong as are left out at once, and
-    the spread is that without them (Rosner 1983, doi:10.1080/00401706.1983.10487848).
+    the spread is that without them (Rosner 1983, doi:10.1080/00401706.1983.10487848). Heights are a mixture, narrow
+    where the prior holds them and wide where the views tell them: it is at least that of the wide ones, which are more
+    than a tenth.
     """
     wrong = max(int(WRONG_PART_MAX * count), 1)
     squares = np.sort(others**2)[: max(len(others) - wrong + 1, 1)]
     freedom = max(len(squares) - 1, 0)
     total = float(np.sum(squares))
+    wide = 0.0
+    if len(others):
+        wide = float(np.quantile(np.abs(others), 1.0 - WRONG_PART_MAX)) / WRONG_QUANTILE_SIGMAS
     chance = 0.25 * OUTLIER_FALSE_ALARMS / count
     wider = np.sqrt(1.0 + 0.5 * np.pi / max(from_views, 1))
     limits = []
@@ -246,7 +252,7 @@ def _limit(
     ):
         if known > 0:
             sigmas = max(HEIGHT_SIGMAS, -wider * float(stdtrit(known, chance)))
-            limits.append(sigmas * max(float(np.sqrt(square / known)), least))
+            limits.append(sigmas * max(float(np.sqrt(square / known)), wide, least))
     return min(limits), float(np.sqrt(total / max(len(squares), 1)))
 
 

@@ -177,6 +177,10 @@ WRONG_PART_MAX = TABLE.stated(
     "WRONG_PART_MAX", 0.1, "of the views",
     "Single views are wrong, not many.",
 )
+WRONG_QUANTILE_SIGMAS = TABLE.derived(
+    "WRONG_QUANTILE_SIGMAS", sigmas_of_chance(WRONG_PART_MAX), "sigma",
+    "Of normal deviates, WRONG_PART_MAX are larger.",
+)
 
 # Plans, in plan.py
 
