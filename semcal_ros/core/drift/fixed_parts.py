@@ -86,7 +86,7 @@ def find_fixed_parts(before: AnyImage, now: AnyImage, shift_px: Array) -> FixedP
     # What lay at x before is seen at x + shift now: look at both of them from each place.
     moved = np.full((2, height, width), np.inf, dtype=np.float32)
     for k, (image, other, sign) in enumerate(((second, first, -1.0), (first, second, 1.0))):
-        there = _look_beside(other, sign * shift_px)
+        there = look_beside(other, sign * shift_px)
         covered = cv2.warpAffine(
             np.ones_like(other),
             _shift_matrix(sign * shift_px),
@@ -125,7 +125,7 @@ def _has_moved(first: Image, second: Image, shift_px: Array, rest: Mask) -> bool
         np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), dtype=np.float32)
         for image in (first, second)
     )
-    there = _look_beside(one, -shift_px)
+    there = look_beside(one, -shift_px)
     squares = [np.sum((two - other)[rest] ** 2, dtype=np.float64) for other in (there, one)]
     return bool(squares[0] < squares[1])
 
@@ -135,7 +135,7 @@ def _shift_matrix(shift_px: Array) -> Array:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
 
 
-def _look_beside(image: Image, shift_px: Array) -> Image:
+def look_beside(image: Image, shift_px: Array) -> Image:
     """What an image shows ``shift_px`` (2,) beside each pixel."""
     there = cv2.warpAffine(
         image,

@@ -56,6 +56,11 @@ class EarlierFrame:
     px_from_unit: Array
     since: int = 0
 
+    def is_like(self, image: AnyImage, px_from_unit: Array) -> bool:
+        """Whether an image has its size, colours and scale."""
+        is_alike = self.image.shape == image.shape
+        return is_alike and bool(np.allclose(self.px_from_unit, px_from_unit))
+
 
 @dataclass(frozen=True)
 class StaticParts:
@@ -188,11 +193,7 @@ class StaticParts:
         of the structure. None where nothing is new.
         """
         parts, earlier, pulled_px = self, self.earlier, None
-        if (
-            earlier is not None
-            and earlier.image.shape == image.shape
-            and np.allclose(earlier.px_from_unit, px_from_unit)
-        ):
+        if earlier is not None and earlier.is_like(image, px_from_unit):
             since = earlier.since + 1
             every = min(1 + max(0, self.comparisons - FIXED_FIRST), FIXED_EVERY_FRAMES_MAX)
             moved_px = drift_px - earlier.drift_px
@@ -216,8 +217,7 @@ class StaticParts:
         anchor = parts.anchor
         if (
             anchor is None
-            or anchor.image.shape != image.shape
-            or not np.allclose(anchor.px_from_unit, px_from_unit)
+            or not anchor.is_like(image, px_from_unit)
             or np.hypot(*(drift_px - anchor.drift_px)) > STRIPE_MOVE_PX_MAX
         ):
             parts = replace(parts, anchor=latest)

@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Image
+from semcal_ros.core.drift.fixed_parts import look_beside
 from semcal_ros.core.drift.thresholds import (
     STRIPE_CELLS_MIN,
     STRIPE_CLIP,
@@ -91,18 +92,17 @@ def find_stripes(before: Image, now: Image, shift_px: Array) -> Stripes:
     margins = np.ceil(np.abs(shift_px)).astype(int) + 2
     if np.any(4 * margins > np.array([width, height])):
         return Stripes()
-    matrix = np.array([[1.0, 0.0, float(shift_px[0])], [0.0, 1.0, float(shift_px[1])]])
     # Of sharp edges, interpolation leaves more.
     first, second = (
         np.asarray(cv2.GaussianBlur(image, (0, 0), STRIPE_SMOOTHED_PX), dtype=np.float32)
         for image in (before, now)
     )
-    moved = cv2.warpAffine(first, matrix, (width, height), flags=cv2.INTER_CUBIC)
+    moved = look_beside(first, -shift_px)
     inside = (
         slice(margins[1], height - margins[1]),
         slice(margins[0], width - margins[0]),
     )
-    own, there = second[inside], np.asarray(moved[inside], dtype=np.float32)
+    own, there = second[inside], moved[inside]
     own, there = own - own.mean(), there - there.mean()
     gain = float(np.vdot(own, there)) / max(float(np.vdot(there, there)), 1e-30)
     left = own - np.float32(gain) * there
