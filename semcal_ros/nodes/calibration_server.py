@@ -259,11 +259,13 @@ class CalibrationServer(StreamNode):
             return
         if self.frames is not None and self.frames.has_rivals:
             self._state.change(CalibrationState.without_picture)
+            self.reporter.forget("picture_stamp")
             return
         self._conditions.take_waiting()
         conditions = Conditions.from_topic(self._conditions.current)
         stage = self._position.at(frame.stamp_ns)
         self._state.change(lambda state: state.with_frame(frame, magnification, stage, conditions))
+        self.reporter.note("picture_stamp", f"{1e-9 * frame.stamp_ns:.3f}")
 
     # -- services ----------------------------------------------------------------------------------
 

@@ -97,12 +97,12 @@ class Session:
         self.image.publish(image_message(picture, stamp_s=float(self.published)))
 
     def wait_seen(self, g: float) -> None:
-        """Wait until the server has all frames and the magnification of the last."""
+        """Wait until the server would make a view of the last frame, which has this magnification."""
 
         def seen() -> bool:
             state = self.peer.state(SERVER)
             return (
-                int(state.get("received", 0)) >= self.published
+                float(state.get("picture_stamp", 0.0)) == self.published
                 and state.get("magnification") == f"{g:.6g}"
             )
 
