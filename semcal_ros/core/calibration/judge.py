@@ -224,6 +224,24 @@ def _name_few_beside(setup: Setup, change: ChangePoint) -> str:
     return f"look first whether {names} was taken at {least:g}, where there are fewer views than elsewhere; else, "
 
 
+def _describe_change(setup: Setup, change: ChangePoint) -> Finding:
+    size = f"by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} %"
+    if change.below == change.above:
+        names = " and ".join(v.name for v in setup.views if v.magnification == change.below)
+        text = (
+            f"the scale at magnification {change.below:g} departs {size} from what the others lead to expect: look "
+            f"whether {names} was taken at {change.below:g}"
+        )
+        return Finding(text, cost_relative=change.relative, magnification=change.below)
+    text = (
+        f"the scale seems to jump {size} between magnifications {change.below:g} and {change.above:g}: "
+        f"{_name_few_beside(setup, change)}if the microscope switches its scan range there, calibrate with this "
+        "breakpoint"
+    )
+    # A smooth curve through a jump is off by half of it on either side.
+    return Finding(text, cost_relative=0.5 * change.relative, magnification=change.below)
+
+
 def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     """Return the joint fit as that of any method, with what is to be said of it."""
     adjustment, result = fit.adjustment, fit.adjustment.result
@@ -244,18 +262,9 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
                 magnification=excess_at,
             )
         )
-    change = find_change_point(setup, fit.padded.problem, fit.padded.result)
+    change = find_change_point(setup, adjustment)
     if change is not None:
-        findings.append(
-            Finding(
-                f"the scale seems to jump by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} % between "
-                f"magnifications {change.below:g} and {change.above:g}: {_name_few_beside(setup, change)}if the "
-                "microscope switches its scan range there, calibrate with this breakpoint",
-                # A smooth curve through a jump is off by half of it on either side.
-                cost_relative=0.5 * change.relative,
-                magnification=change.below,
-            )
-        )
+        findings.append(_describe_change(setup, change))
     if not adjustment.converged:
         findings.append(Finding("the choice of the number of coefficients did not converge"))
     details = {

@@ -24,15 +24,17 @@ What is found here is left out in :mod:`semcal_ros.core.calibration.pipeline`, w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.linalg import solve_triangular
+from scipy.special import stdtrit
 
-from semcal_ros.core.arrays import Array, Indices, solve_scaled
-from semcal_ros.core.calibration.estimator.blocks import Problem
+from semcal_ros.core.arrays import Array, Indices, Mask, invert_scaled, solve_scaled
+from semcal_ros.core.calibration.estimator.blocks import Effects, Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    Adjustment,
     BundleResult,
     refine,
     variance_factor,
@@ -48,6 +50,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     MISFIT_RATIO,
     OUTLIER_FALSE_ALARMS,
     SHAPE_SPREAD_MIN,
+    STEP_LEFT_MIN,
     TILT_SIGMAS,
     USUAL_VIEWS,
     VIEWS_MIN,
@@ -55,17 +58,19 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     WRONG_QUANTILE_SIGMAS,
 )
 from semcal_ros.core.calibration.views import ViewStatus
+from semcal_ros.core.camera.calibration_model import columns_of
 from semcal_ros.core.errors import Rejection
 
 
 @dataclass(frozen=True)
 class ChangePoint:
-    """A jump of the scale that the views indicate.
+    """What the scales of the magnifications do that a smooth function does not: a jump, or one that is odd.
 
     Attributes
     ----------
     below, above
-        Neighbouring magnifications between which the jump lies.
+        Neighbouring magnifications between which the scale jumps. They are the same one where this magnification alone
+        departs from the course of the others.
     relative, sigma
         Size relative to the scale, and its 1-sigma.
     """
@@ -76,13 +81,110 @@ class ChangePoint:
     sigma: float
 
 
-def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> ChangePoint | None:
-    """Find the jump that would improve an adjustment most, or None if none is significant.
+@dataclass(frozen=True)
+class FreeScales:
+    """Scales of the M magnifications, each free, over the nominal ones.
 
-    ``problem`` and ``result`` are the adjustment at its optimum, with coefficients beyond those that were chosen: what
-    a smooth function may do besides is no jump. Breakpoints that it already has are left out. A recording without a
-    jump shows one with the chance `JUMP_FALSE_ALARMS`, shared among its places by Bonferroni's inequality.
+    Attributes
+    ----------
+    departure
+        (M,) from the adjusted ones.
+    half
+        (M, M) lower triangle whose square is their covariance if visits scatter as usual.
+    repeated_squares, repeated
+        Sum of the squares of what visits of one magnification differ by, in usual sigmas, and how many such differences
+        the views determine.
     """
+
+    departure: Array
+    half: Array
+    repeated_squares: float
+    repeated: float
+
+    def whiten(self, values: Array) -> Array:
+        """Values (M,) or (M, n) in sigmas."""
+        return np.asarray(solve_triangular(self.half, values, lower=True), dtype=np.float64)
+
+
+def find_change_point(setup: Setup, adjustment: Adjustment) -> ChangePoint | None:
+    """Find the most significant jump of the scale between two magnifications, or None if none is significant.
+
+    The scales of the magnifications, each free, are compared with the chosen function of the adjustment, with and
+    without a step between two of them, or a departure of one alone (:func:`find_change`). Breakpoints that the function
+    already has are left out.
+
+    It fails to find a jump where the function has nearly as many coefficients as there are magnifications that were
+    each visited once.
+    """
+    g = setup.magnifications
+    index = np.arange(len(g))
+    candidates = [
+        (g[k - 1], g[k], index >= k)
+        for k in range(1, len(g))
+        if not any(g[k - 1] < b <= g[k] for b in setup.breakpoints)
+    ]
+    # The lowest or the highest one alone is a step, too.
+    candidates += [(g[k], g[k], index == k) for k in range(1, len(g) - 1)]
+    own = columns_of(adjustment.functions)["scale"]
+    smooth = adjustment.problem.designs[:, 0, own] / setup.nominal_px_per_m(g)[:, None]
+    scales = _free_scales(setup, adjustment)
+    found = find_change(scales, smooth, [where for _, _, where in candidates])
+    if found is None:
+        return None
+    below, above, _ = candidates[found[0]]
+    return ChangePoint(float(below), float(above), *found[1:])
+
+
+def find_change(
+    scales: FreeScales, smooth: Array, candidates: Sequence[Mask]
+) -> tuple[int, float, float] | None:
+    """Find the candidate by which the scales change most significantly besides a smooth function.
+
+    How much they scatter about it is not known: it is estimated from what the function and the change leave, from what
+    visits of the same magnification differ by, and from the usual scatter of visits as one observation, so that a
+    change has to be significant by Student's t. Without one, one is found with the chance `JUMP_FALSE_ALARMS`, shared
+    among the candidates by Bonferroni's inequality.
+
+    Parameters
+    ----------
+    scales
+        Scales of the M magnifications.
+    smooth
+        (M, K) values of the functions whose sum is the smooth one.
+    candidates
+        (M,) where the scale is changed, for each.
+
+    Returns
+    -------
+    Index of the candidate, relative size of the change and its 1-sigma, or None if none is significant.
+    """
+    freedom = len(smooth) - smooth.shape[1] + scales.repeated
+    if not candidates or freedom <= 0.0:
+        return None
+    basis = np.linalg.qr(scales.whiten(smooth))[0]
+    left = scales.whiten(scales.departure)
+    left -= basis @ (basis.T @ left)
+    highest = -float(stdtrit(freedom, 0.5 * JUMP_FALSE_ALARMS / len(candidates)))
+    best = None
+    for k, where in enumerate(candidates):
+        change = scales.whiten(where.astype(np.float64))
+        whole = change @ change
+        change -= basis @ (basis.T @ change)
+        information = change @ change
+        if information < STEP_LEFT_MIN * whole:
+            continue
+        size = float(change @ left / information)
+        scatter = left @ left - size**2 * information + scales.repeated_squares
+        sigma = float(np.sqrt((np.maximum(scatter, 0.0) + 1.0) / (freedom * information)))
+        if abs(size) > highest * sigma:
+            highest = abs(size) / sigma
+            best = k, size, sigma
+    return best
+
+
+def _free_scales(setup: Setup, adjustment: Adjustment) -> FreeScales:
+    problem, result = adjustment.problem, adjustment.result
+    squares, repeated = 0.0, 0.0
     if problem.effects is not None:
         # A jump that is not in the model makes the visits look as if they did not come back.
         effects = replace(
@@ -92,40 +194,38 @@ def find_change_point(setup: Setup, problem: Problem, result: BundleResult) -> C
         )
         problem = replace(problem, effects=effects)
         result = refine(problem, result.state, tolerance=1e-4)
-    scatter, determined = 0.0, 0.0
-    if problem.effects is not None:
-        squares = problem.effects.visit_sigmas**2
-        scatter = float(np.sum(result.state.visits**2 / squares))
-        determined = float(np.sum(np.maximum(1.0 - result.visit_variance / squares, 0.0)))
+        squares, repeated = _compare_visits(effects, result)
+    own = columns_of(adjustment.functions)["scale"]
+    nominal = setup.nominal_px_per_m(setup.magnifications)
     matrix, right = result.equations(problem)
-    g = setup.magnifications
-    nominal = setup.nominal_px_per_m(g)
+    others = np.delete(np.arange(len(right)), np.arange(own.start, own.stop))
+    pull = result.information[:, :, 0] * nominal[:, None]
+    cross = np.einsum("mpk,mp->km", problem.designs, pull)[others]
+    inner = np.diag(pull[:, 0] * nominal)
+    gradient = result.gradient[:, 0] * nominal
+    solved = solve_scaled(matrix[np.ix_(others, others)], np.column_stack([cross, right[others]]))
+    information = inner - cross.T @ solved[:, :-1]
+    covariance = invert_scaled(0.5 * (information + information.T))
+    departure = covariance @ (gradient - cross.T @ solved[:, -1])
     variance = max(variance_factor(problem, result), 1.0)
-    # Scatter of few visits is known badly: by Student's t, the same chance needs a larger gain.
-    freedom = max(determined - 1.0, 1.0)
-    places = [
-        k for k in range(1, len(g)) if not any(g[k - 1] < b <= g[k] for b in setup.breakpoints)
-    ]
-    chance = 0.5 * JUMP_FALSE_ALARMS / max(len(places), 1)
-    by_corners, by_visits = (0.5 * x**2 for x in (ndtri(chance), stdtrit(freedom, chance)))
-    best, best_excess = None, 1.0
-    for k in places:
-        column = np.where(np.arange(len(g)) >= k, nominal, 0.0)
-        pull = result.information[:, :, 0] * column[:, None]
-        cross = np.einsum("mpk,mp->k", problem.designs, pull)
-        solved = solve_scaled(matrix, np.stack([cross, right], axis=1))
-        information = float(pull[:, 0] @ column) - cross @ solved[:, 0]
-        information += setup.priors.scale_jump**-2.0
-        gradient = float(result.gradient[:, 0] @ column) - cross @ solved[:, 1]
-        gain = 0.5 * gradient**2 / information
-        # Where the jump leaves much of the scatter between visits, they do not come back anyway.
-        left = (scatter - 2.0 * gain) / freedom
-        limit = variance * by_corners if left <= variance else left * by_visits
-        if gain > best_excess * limit:
-            sigma = float(np.sqrt(max(variance, left) / information))
-            best_excess = gain / limit
-            best = ChangePoint(float(g[k - 1]), float(g[k]), float(gradient / information), sigma)
-    return best
+    half = np.asarray(
+        np.linalg.cholesky(0.5 * variance * (covariance + covariance.T)), dtype=np.float64
+    )
+    return FreeScales(departure, half, squares / variance, repeated)
+
+
+def _compare_visits(effects: Effects, result: BundleResult) -> tuple[float, float]:
+    """Return the sum of squares of what visits of one magnification differ by, in sigmas, and how many differences are
+    determined.
+    """
+    scale = result.state.visits[:, 0] / effects.scale_sigma
+    known = np.maximum(1.0 - result.visit_variance[:, 0] / effects.scale_sigma**2, 0.0)
+    squares, repeated = 0.0, 0.0
+    for group in np.unique(effects.visit_group):
+        own = effects.visit_group == group
+        squares += float(np.sum((scale[own] - scale[own].mean()) ** 2))
+        repeated += float(np.mean(known[own]) * (own.sum() - 1))
+    return squares, repeated
 
 
 def find_wrong_tilts(problem: Problem, result: BundleResult) -> Mapping[int, float]:

@@ -132,6 +132,11 @@ JUMP_FALSE_ALARMS = TABLE.defined(
     "With which a recording without a jump of the scale is said to have one, at any of its places and in either "
     "direction: once in 100 recordings.",
 )
+STEP_LEFT_MIN = TABLE.stated(
+    "STEP_LEFT_MIN", 1e-3, "of the information",
+    "On a step of the scale, that the chosen function has to leave: where it can follow the step, there is nothing to "
+    "find.",
+)
 TILT_SIGMAS = TABLE.derived(
     "TILT_SIGMAS", 5.0, "sigma",
     "Deviation of a tilt from what the stage says, beyond which one of the two is wrong: by chance one of 1.7 "
