@@ -210,7 +210,7 @@ class StaticParts:
                 if drawn is not None and drawn.shape == stays.shape:
                     stays = stays & ~drawn
                 if float(np.mean(stays & ~known)) > NEWLY_FIXED:
-                    pulled_px = share_of_gradients(image, stays) * moved_px
+                    pulled_px = share_of_gradients(image, stays & ~known) * moved_px
         elif self.fixed is not None and self.fixed.shape != image.shape[:2]:
             parts = replace(self, fixed=None)
         latest = EarlierFrame(image.copy(), drift_px, px_from_unit)

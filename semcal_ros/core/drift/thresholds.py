@@ -234,6 +234,11 @@ NEWLY_FIXED = TABLE.stated(
     "That must newly be found to stay for keyframes to be freed of it, which makes their means start again: 25 of "
     "512 x 512 px.",
 )
+FIXED_PULL_MIN = TABLE.derived(
+    "FIXED_PULL_MIN", 0.3, "sigma",
+    "By which what newly stays has pulled the drift, for the frame to be measured again: less adds less than 5 % to "
+    "the error of a frame.",
+)
 
 # What stays in place, in fixed_parts.py
 

@@ -56,6 +56,7 @@ from semcal_ros.core.drift.static_parts import StaticParts
 from semcal_ros.core.drift.stripes import Stripes
 from semcal_ros.core.drift.thresholds import (
     CANDIDATES,
+    FIXED_PULL_MIN,
     PAUSE_MIN,
     STRIPE_CELLS_MIN,
     STRIPE_CELLS_TRIED,
@@ -228,8 +229,8 @@ def _find_flaw(state: TrackerState, *, is_repeated: bool) -> Rejection[MatchFail
 def _look_for_fixed(
     setup: TrackerSetup, state: TrackerState, frame: ScanFrame, raw: AnyImage
 ) -> tuple[TrackerState, bool]:
-    """Look for what stays in place, in a frame that was measured, as it came (``raw``). Where something is new, it has
-    pulled this frame and those before: they are worth less, and the keyframes are freed of it.
+    """Look for what stays in place, in a frame that was measured, as it came (``raw``). The keyframes are freed of what
+    is new. Where it has pulled this frame and those before, they are worth less, and the frame is measured again.
     """
     px_from_unit = frame.px_from_unit
     drift_px = px_from_unit @ state.filter.state.position
@@ -238,6 +239,9 @@ def _look_for_fixed(
     if pulled_px is None:
         return state, False
     pulled = np.linalg.solve(px_from_unit, pulled_px)
+    squares = pulled @ np.linalg.solve(state.filter.state.covariance[:2, :2], pulled)
+    if squares < FIXED_PULL_MIN**2:
+        return clean_keyframes(setup, state), False
     widened = state.filter.widen_measurements(np.outer(pulled, pulled))
     # The frame is measured once more, and is no repeated one.
     return clean_keyframes(setup, replace(state, filter=widened, sample=b"")), True
@@ -265,6 +269,9 @@ def _follow_without_stripes(
     if static.stripes == state.static.stripes:
         return found
     cleaned, frame = _without(setup, state, static, replace(found[2], image=raw))
+    if rejection is None:
+        # It only decides.
+        cleaned = replace(cleaned, filter=replace(cleaned.filter, adapts=False))
     freed, without = _follow(setup, cleaned, frame)
     if not without.accepted or without.along is not None:
         return found
