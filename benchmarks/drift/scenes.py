@@ -134,6 +134,25 @@ def pillars(rng: Rng) -> Floats:
     return out
 
 
+def pores(rng: Rng) -> Floats:
+    """As of anodic alumina: nearly a lattice of hexagons, of which none is in its place."""
+    rows, columns = 4 * int(rng.integers(12, 20)), 2 * int(rng.integers(20, 35))
+    wide, high = TORUS / columns, TORUS / rows
+    off = rng.uniform(0.03, 0.08) * min(wide, high)
+    out = np.full((TORUS, TORUS), 0.6)
+    near = np.arange(-int(wide + high), int(wide + high) + 1)
+    for row in range(rows):
+        for column in range(columns):
+            x, y = (column + 0.5 * (row % 2)) * wide, row * high
+            x, y = np.array([x, y]) + rng.normal(0.0, off, 2)
+            r = min(wide, high) * rng.normal(0.32, 0.02)
+            px, py = int(x) + near, int(y) + near
+            inside = np.hypot(px[None, :] - x, py[:, None] - y)
+            dark = 0.35 / (1.0 + np.exp(np.clip((inside - r) / 0.6, -50.0, 50.0)))
+            out[np.ix_(py % TORUS, px % TORUS)] -= dark
+    return out
+
+
 def holes(rng: Rng) -> Floats:
     return 0.6 - _discs(rng, 120, (5.0, 13.0), (0.3, 0.5))
 
@@ -349,6 +368,8 @@ KINDS: dict[str, Kind] = {
     "wires": Kind(wires),
     "pillars": Kind(pillars),
     "holes": Kind(holes),
+    "pores": Kind(pores),
+    "pores and a jump": Kind(pores, jump_px=20.0),
     "lattice": Kind(lattice),
     "tool over gold": Kind(gold, tool),
     "tool over sparse": Kind(sparse, tool),

@@ -15,9 +15,10 @@
 """Which of the shifts that show a periodic specimen alike is its shift: its defects tell.
 
 All shifts that differ by a period show a perfect lattice alike. Defects decide: at a wrong shift, every defect
-disagrees twice, where it is and where it should be. What no defect tells is refused where the lattice is fine, since a
-prediction would only hide a jump by a period. Where a period is a good part of the field, a jump by one is a move of
-the stage and no drift, and a prediction that is good to a tenth of it decides.
+disagrees twice, where it is and where it should be. Of a disordered lattice, such as the pores of anodic alumina, each
+cell is a little defect: at a wrong shift, nearly all tiles disagree by a part of their structure. What neither tells is
+refused where the lattice is fine, since a prediction would only hide a jump by a period. Where a period is a good part
+of the field, a jump by one is a move of the stage and no drift, and a prediction that is good to a tenth of it decides.
 
 What does not repeat in an image by itself, such as a tool over the lattice, has no say: where either image does not
 show the lattice, or next to it, tiles count neither for the refinement nor as defects. A tool moves by itself, and its
@@ -51,6 +52,9 @@ from semcal_ros.core.registration.periodicity import is_fine
 from semcal_ros.core.registration.thresholds import (
     DEFECT_EVIDENCE_MAX,
     DEFECT_SIGMAS,
+    DISORDER_MIN,
+    DISORDERED_SHARE_MIN,
+    DISORDERED_TILES_MIN,
     EVIDENCE_MIN,
     HALF_PERIOD_SIGMAS,
     PERIODS_COMPARED_MAX,
@@ -129,12 +133,15 @@ class _Candidate:
         The shift.
     energies
         (rows, cols) mean squared residuals of all tiles of the reference; NaN where none were compared.
+    structure
+        (rows, cols) variance of what the reference shows in them, in grey levels of the image.
     counted
         (rows, cols) the tiles that show the lattice there.
     """
 
     alignment: Alignment
     energies: Array
+    structure: Array
     counted: Mask
 
     @property
@@ -182,17 +189,17 @@ def choose_period(
     best = compared[0]
     for other in compared[1:]:
         pro, contra = _weigh(best, other)
-        if pro < contra:
+        if _is_worse_everywhere(best, other) or (
+            pro < contra and not _is_worse_everywhere(other, best)
+        ):
             best = other
     predicted = _find_predicted(compared, periods, guess, spread, level.size)
-    if predicted is not None and (
-        predicted is best or not _tells(_weigh(best, predicted), EVIDENCE_MIN)
-    ):
+    if predicted is not None and (predicted is best or not _tells(best, predicted, EVIDENCE_MIN)):
         return _leave_out(pyramid, predicted, noise, shown)
     least = _find_least_evidence(best, noise)
     x, y = best.shift_px.tolist()
     for other in compared:
-        if other is not best and not _tells(_weigh(best, other), least):
+        if other is not best and not _tells(best, other, least):
             a, b = other.shift_px.tolist()
             return Rejection(
                 MatchFailure.AMBIGUOUS,
@@ -231,10 +238,11 @@ def _compare_shifts(
             continue
         tiles = found.tile_statistics()
         assert tiles is not None
-        energies = np.full(level.normal_matrices.shape[:2], np.nan)
+        energies, structure = np.full((2, *level.normal_matrices.shape[:2]), np.nan)
         squares = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
         energies[tiles.rows, tiles.cols] = squares / tiles.pixels
-        compared.append(_Candidate(found, energies, shown.at(found.shift_px)))
+        structure[tiles.rows, tiles.cols] = tiles.gain**2 * tiles.reference / tiles.pixels
+        compared.append(_Candidate(found, energies, structure, shown.at(found.shift_px)))
     return compared
 
 
@@ -345,10 +353,23 @@ def _list_shifts(
     return found[order[allowed]][:PERIODS_COMPARED_MAX]
 
 
-def _tells(evidence: tuple[float, float], least: float) -> bool:
-    """Whether the defects are where the first of two shifts says, and none where the second does."""
-    pro, contra = evidence
+def _tells(first: _Candidate, second: _Candidate, least: float) -> bool:
+    """Whether the defects are where the first of two shifts says, and none where the second does, or the second is
+    worse everywhere.
+    """
+    if _is_worse_everywhere(second, first):
+        return True
+    pro, contra = _weigh(first, second)
     return pro >= least and contra < DEFECT_EVIDENCE_MAX
+
+
+def _is_worse_everywhere(first: _Candidate, second: _Candidate) -> bool:
+    """Whether the first of two shifts leaves more of the structure than the second in nearly all tiles."""
+    excess = (first.energies - second.energies) / np.maximum(second.structure, 1e-30)
+    own = excess[np.isfinite(excess) & first.counted & second.counted]
+    if len(own) < DISORDERED_TILES_MIN:
+        return False
+    return float(np.mean(own > DISORDER_MIN)) >= DISORDERED_SHARE_MIN
 
 
 def _weigh(first: _Candidate, second: _Candidate) -> tuple[float, float]:

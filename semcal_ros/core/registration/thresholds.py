@@ -389,6 +389,20 @@ EVIDENCE_MIN = TABLE.derived(
     "EVIDENCE_MIN", 2.0 * DEFECT_EVIDENCE_MAX, "squared sigmas",
     "That tells two shifts apart: two defects.",
 )
+DISORDER_MIN = TABLE.stated(
+    "DISORDER_MIN", 0.05, "of the structure",
+    "That a wrong shift of a disordered lattice leaves of a tile: cells displaced by 0.6 of 16 px leave 0.14 to 0.17 "
+    "(median), a perfect lattice up to 0.019, by the interpolation of sharp edges.",
+)
+DISORDERED_SHARE_MIN = TABLE.stated(
+    "DISORDERED_SHARE_MIN", 0.75, "of the tiles",
+    "In which it does: 0.88 of such a lattice, at most 0.22 of perfect ones with periods of 10 to 24 px.",
+)
+DISORDERED_TILES_MIN = TABLE.derived(
+    "DISORDERED_TILES_MIN", 30, "tiles",
+    "Of which three quarters are worse by chance, where half would be, once in 380 pairs of shifts (binomial); by "
+    "that part of the structure more seldom.",
+)
 COARSE_PERIOD_MIN = TABLE.measured(
     "COARSE_PERIOD_MIN", 1.0 / 16.0, "of the shorter side",
     "From which on a period is coarse. 1.5 times as large or as small, it changes nothing in 4 cases; a thousand "

@@ -143,8 +143,63 @@ def test_defects_that_are_left_unexplained_ask_for_more_evidence() -> None:
     for start in (shift, guess):
         found = align([level], pyramid, start)
         assert isinstance(found, Alignment)
-        candidate = _Candidate(found, np.zeros(everywhere.shape), everywhere)
+        zeros, ones = np.zeros(everywhere.shape), np.ones(everywhere.shape)
+        candidate = _Candidate(found, zeros, ones, everywhere)
         least.append(_find_least_evidence(candidate, noise))
     # Two defects, and one more than the four that the second shift does not explain.
     assert least[0] == EVIDENCE_MIN
     assert least[1] == 5.0 * DEFECT_EVIDENCE_MAX
+
+
+def draw_pores(
+    pitch: float, disorder: float, shift: Array, seed: int = 5, soft_px: float = 0.8
+) -> Array:
+    """Dark pores on a lattice of squares, each displaced by ``disorder`` of the pitch (normal, 1-sigma)."""
+    rng = np.random.default_rng(seed)
+    picture = np.ones((SIZE, SIZE))
+    near = np.arange(-int(pitch), int(pitch) + 1)
+    for place in np.ndindex(2 * int(SIZE / pitch), 2 * int(SIZE / pitch)):
+        at = pitch * (np.array(place) + disorder * rng.normal(size=2)) - 0.5 * SIZE + shift
+        x, y = (
+            values[(values >= 0) & (values < SIZE)]
+            for values in np.rint(at).astype(int)[:, None] + near
+        )
+        distance = np.hypot(x[None, :] - at[0], y[:, None] - at[1])
+        picture[np.ix_(y, x)] -= 1.0 / (1.0 + np.exp((distance - 0.3 * pitch) / soft_px))
+    return picture
+
+
+@pytest.mark.parametrize("jump", [(0, 0), (1, 0), (1, -1), (0, 2)])
+@pytest.mark.parametrize("pitch", [7.3, 10.0])
+def test_the_disorder_of_a_lattice_tells_a_jump_by_periods(
+    pitch: float, jump: tuple[int, int]
+) -> None:
+    drift = np.array([0.4, -0.3])
+    shift = drift + pitch * np.array(jump)
+    pair = draw_pores(pitch, 0.05, np.zeros(2)), draw_pores(pitch, 0.05, shift)
+    found = compare(*pair, drift, 0.5)
+    assert found.accepted, found.reason
+    np.testing.assert_allclose(found.shift_px, shift, atol=0.06)
+
+
+@pytest.mark.parametrize("soft_px", [0.2, 0.8])
+@pytest.mark.parametrize("sigma", [0.3, 4.0])
+@pytest.mark.parametrize("pitch", [7.3, 10.0])
+def test_edges_that_are_interpolated_are_no_disorder(
+    pitch: float, sigma: float, soft_px: float
+) -> None:
+    """Shifts by a period that is no whole number of pixels differ in what interpolation does to sharp edges."""
+    shift = np.array([0.4, -0.3])
+    pair = [
+        noisy(draw_pores(pitch, 0.0, at, soft_px=soft_px), sigma, k)
+        for k, at in enumerate((np.zeros(2), shift + [pitch, 0.0]))
+    ]
+    found = register_pair(*pair, guess_px=shift, guess_covariance=np.eye(2) * 0.25)
+    assert not found.accepted
+
+
+def test_a_jump_farther_than_what_is_compared_is_refused() -> None:
+    pitch, drift = 7.3, np.array([0.4, -0.3])
+    pair = draw_pores(pitch, 0.05, np.zeros(2)), draw_pores(pitch, 0.05, drift + 6.0 * pitch)
+    found = compare(*pair, drift, 0.5)
+    assert not found.accepted or np.max(np.abs(found.shift_px - drift - 6.0 * pitch)) < 0.06
