@@ -153,6 +153,14 @@ def pores(rng: Rng) -> Floats:
     return out
 
 
+def dusty_grating(rng: Rng) -> Floats:
+    """Lines with particles on them, which alone tell the place along the lines."""
+    m, n = int(rng.integers(30, 80)), int(rng.integers(2, 20))
+    y, x = np.mgrid[:TORUS, :TORUS] / TORUS
+    lines = 0.3 + 0.12 * np.tanh(3.0 * np.cos(2 * np.pi * (m * x + n * y)))
+    return lines + _discs(rng, 150, (3.0, 6.0), (0.25, 0.4))
+
+
 def holes(rng: Rng) -> Floats:
     return 0.6 - _discs(rng, 120, (5.0, 13.0), (0.3, 0.5))
 
@@ -370,6 +378,7 @@ KINDS: dict[str, Kind] = {
     "holes": Kind(holes),
     "pores": Kind(pores),
     "pores and a jump": Kind(pores, jump_px=20.0),
+    "dusty grating": Kind(dusty_grating),
     "lattice": Kind(lattice),
     "tool over gold": Kind(gold, tool),
     "tool over sparse": Kind(sparse, tool),

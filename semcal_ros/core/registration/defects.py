@@ -50,6 +50,7 @@ from semcal_ros.core.registration.inverse_compositional import (
 )
 from semcal_ros.core.registration.periodicity import is_fine
 from semcal_ros.core.registration.thresholds import (
+    ALONG_STARTS_PX,
     DEFECT_EVIDENCE_MAX,
     DEFECT_SIGMAS,
     DISORDER_MIN,
@@ -137,12 +138,15 @@ class _Candidate:
         (rows, cols) variance of what the reference shows in them, in grey levels of the image.
     counted
         (rows, cols) the tiles that show the lattice there.
+    is_held
+        Whether it was only refined across the lines of a grating, since nothing tells a place along them there.
     """
 
     alignment: Alignment
     energies: Array
     structure: Array
     counted: Mask
+    is_held: bool = False
 
     @property
     def shift_px(self) -> Array:
@@ -193,6 +197,10 @@ def choose_period(
             pro < contra and not _is_worse_everywhere(other, best)
         ):
             best = other
+    if best.is_held:
+        return Rejection(
+            MatchFailure.AMBIGUOUS, "ambiguous: lines, whose defects do not tell a place along them"
+        )
     predicted = _find_predicted(compared, periods, guess, spread, level.size)
     if predicted is not None and (predicted is best or not _tells(best, predicted, EVIDENCE_MIN)):
         return _leave_out(pyramid, predicted, noise, shown)
@@ -225,13 +233,17 @@ def _compare_shifts(
 ) -> list[_Candidate] | Rejection[MatchFailure]:
     """The shifts of the class, each refined by what shows the lattice."""
     level = shown.level
-    first = _refine(pyramid, start_px, noise, shown)
+    first = _refine_first(pyramid, start_px, noise, shown)
     if isinstance(first, Rejection):
         return first
     shifts = _list_shifts(first.shift_px, periods, guess, spread, level.size)
     compared: list[_Candidate] = []
     for shift in shifts:
         found = _refine(pyramid, shift, noise, shown)
+        is_held = isinstance(found, Rejection) or not found.converged
+        if is_held and shown.is_all:
+            # Of lines, only defects tell the place along them, which are elsewhere.
+            found = align([level], pyramid, shift, held=_along_lines(level))
         if isinstance(found, Rejection) or not found.converged:
             continue
         if any(np.max(np.abs(found.shift_px - c.shift_px)) < SAME_SHIFT_PX for c in compared):
@@ -242,8 +254,29 @@ def _compare_shifts(
         squares = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
         energies[tiles.rows, tiles.cols] = squares / tiles.pixels
         structure[tiles.rows, tiles.cols] = tiles.gain**2 * tiles.reference / tiles.pixels
-        compared.append(_Candidate(found, energies, structure, shown.at(found.shift_px)))
+        counted = shown.at(found.shift_px)
+        compared.append(_Candidate(found, energies, structure, counted, is_held))
     return compared
+
+
+def _refine_first(
+    pyramid: Pyramid, start_px: Array, noise: TileNoise, shown: _Shown
+) -> Alignment | Rejection[MatchFailure]:
+    """The shift next to a start, also where that is a pixel off along the lines of a grating."""
+    first = _refine(pyramid, start_px, noise, shown)
+    along = _along_lines(shown.level)
+    for aside_px in ALONG_STARTS_PX if shown.is_all else ():
+        if isinstance(first, Alignment) and first.converged:
+            return first
+        other = _refine(pyramid, start_px + aside_px * along, noise, shown)
+        first = other if isinstance(other, Alignment) and other.converged else first
+    return first
+
+
+def _along_lines(level: PyramidLevel) -> Array:
+    """(2,) direction in which a reference has the least gradients."""
+    whole = level.normal_matrices[..., :2, :2].sum(axis=(0, 1))
+    return np.asarray(np.linalg.eigh(whole)[1][:, 0])
 
 
 def _refine(

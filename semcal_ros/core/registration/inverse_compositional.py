@@ -62,6 +62,7 @@ from semcal_ros.core.registration.thresholds import (
     FREEDOM_MIN,
     GAIN_MIN,
     HESSIAN_PIXELS,
+    LOPSIDED_MAX,
     MEDIAN_CHI2,
     NOISE_ROWS_MIN,
     PASSES_MAX,
@@ -432,6 +433,9 @@ def _align(
         if isinstance(comparison, Rejection):
             return comparison
         passes += 1
+        if held is None and enough != ALL_PIXELS and _is_lopsided(comparison.sums.hessian):
+            enough, hessian = ALL_PIXELS, None
+            continue
         shift = comparison.improved * levels[-1].factor
         # Far from the right shift the gradients have less in common.
         hessian = comparison.sums.hessian if comparison.length < STEP_PX_MAX else None
@@ -443,6 +447,12 @@ def _align(
     found = comparison.fit.information
     chance = _find_chance_gradient(comparison.level, comparison.geometry, found, enough)
     return chance or _summarise(comparison, covariance, converged, passes)
+
+
+def _is_lopsided(hessian: Array) -> bool:
+    """Whether one direction has so little of the gradients that those of some pixels do not tell it."""
+    least, most = np.linalg.eigvalsh(hessian)
+    return bool(least < LOPSIDED_MAX * most)
 
 
 def _has_converged(comparison: _Comparison, covariance: Array) -> bool:

@@ -403,6 +403,10 @@ DISORDERED_TILES_MIN = TABLE.derived(
     "Of which three quarters are worse by chance, where half would be, once in 380 pairs of shifts (binomial); by "
     "that part of the structure more seldom.",
 )
+ALONG_STARTS_PX = TABLE.cost(
+    "ALONG_STARTS_PX", (-0.6, 0.6, -1.2, 1.2), "px",
+    "Along lines, from which the shift is refined where the peak of the correlation is no start: lines make it long.",
+)
 COARSE_PERIOD_MIN = TABLE.measured(
     "COARSE_PERIOD_MIN", 1.0 / 16.0, "of the shorter side",
     "From which on a period is coarse. 1.5 times as large or as small, it changes nothing in 4 cases; a thousand "
@@ -635,6 +639,11 @@ HESSIAN_PIXELS = TABLE.cost(
     "HESSIAN_PIXELS", 12_000, "px",
     "From which the Gauss-Newton Hessian is taken: their gradients tell it to 1 %, and the gradients of the image "
     "cost more than all other sums.",
+)
+LOPSIDED_MAX = TABLE.derived(
+    "LOPSIDED_MAX", 0.1, "of the larger eigenvalue",
+    "Of the Hessian, below which the smaller one is told by all pixels: an error of 1 % of the larger one would be "
+    "10 % of it, so that steps along the lines of a grating do not converge.",
 )
 ALL_PIXELS = TABLE.defined(
     "ALL_PIXELS", 2**62, "px",

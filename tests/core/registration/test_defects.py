@@ -203,3 +203,40 @@ def test_a_jump_farther_than_what_is_compared_is_refused() -> None:
     pair = draw_pores(pitch, 0.05, np.zeros(2)), draw_pores(pitch, 0.05, drift + 6.0 * pitch)
     found = compare(*pair, drift, 0.5)
     assert not found.accepted or np.max(np.abs(found.shift_px - drift - 6.0 * pitch)) < 0.06
+
+
+def draw_grating(period: float, angle: float, shift: Array, particles: Array) -> Array:
+    """Lines, and particles (n, 2) on them."""
+    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    u = np.cos(angle) * (x - shift[0]) + np.sin(angle) * (y - shift[1])
+    whole = np.cos(2.0 * np.pi * u / period)
+    for at in particles + shift:
+        whole += 2.0 / (1.0 + np.exp(np.clip(np.hypot(x - at[0], y - at[1]) - 4.0, -50.0, 50.0)))
+    return np.asarray(whole)
+
+
+@pytest.mark.parametrize("jump", [0, 1, -2])
+@pytest.mark.parametrize("period", [8.0, 13.0])
+def test_particles_on_a_grating_tell_the_period_and_the_place_along_it(
+    period: float, jump: int
+) -> None:
+    angle, drift = 0.3, np.array([0.4, -0.3])
+    shift = drift + jump * period * np.array([np.cos(angle), np.sin(angle)])
+    particles = np.random.default_rng(2).uniform(20.0, SIZE - 20.0, (30, 2))
+    pair = [draw_grating(period, angle, at, particles) for at in (np.zeros(2), shift)]
+    found = compare(*pair, drift, 0.5)
+    # A jump may be refused.
+    assert found.accepted or jump, found.reason
+    if found.accepted:
+        assert found.along is None
+        np.testing.assert_allclose(found.shift_px, shift, atol=0.06)
+
+
+@pytest.mark.parametrize("period", [8.0, 13.0])
+def test_a_plain_grating_tells_no_place_along_it(period: float) -> None:
+    pair = [
+        draw_grating(period, 0.3, at, np.zeros((0, 2)))
+        for at in (np.zeros(2), np.array([0.4, -0.3]))
+    ]
+    found = compare(*pair, np.array([0.4, -0.3]), 0.5)
+    assert not found.accepted or found.along is not None
