@@ -16,7 +16,7 @@
 
 All shifts that differ by a period show a perfect lattice alike. Defects decide: at a wrong shift, every defect
 disagrees twice, where it is and where it should be. Of a disordered lattice, such as the pores of anodic alumina, each
-cell is a little defect: at a wrong shift, nearly all tiles disagree by a part of their structure. What neither tells is
+cell is a little defect: at a wrong shift, most tiles disagree by a part of their structure. What neither tells is
 refused where the lattice is fine, since a prediction would only hide a jump by a period. Where a period is a good part
 of the field, a jump by one is a move of the stage and no drift, and a prediction that is good to a tenth of it decides.
 
@@ -28,6 +28,7 @@ explain, which was not among the compared ones: more defects have to speak for a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -58,6 +59,7 @@ from semcal_ros.core.registration.thresholds import (
     DISORDERED_TILES_MIN,
     EVIDENCE_MIN,
     HALF_PERIOD_SIGMAS,
+    NOISE_DOUBT,
     PERIODS_COMPARED_MAX,
     PERIODS_REACH_SIGMAS,
     SAME_SHIFT_PX,
@@ -159,6 +161,7 @@ def choose_period(
     pyramid: Pyramid,
     periods: Array,
     start_px: Array,
+    highest_px: Array,
     guess: Array,
     spread: Array | None,
     noise: TileNoise,
@@ -174,6 +177,9 @@ def choose_period(
         As found by :func:`~semcal_ros.core.registration.periodicity.find_periods`.
     start_px
         (2,) any shift that explains the image.
+    highest_px
+        (2,) the one of the highest correlation. It is compared, too, where all of both images shows the lattice: it
+        may be farther than what a prediction allows.
     guess, spread
         (2,) predicted shift and its covariance (2, 2), or None.
     noise
@@ -184,9 +190,14 @@ def choose_period(
     """
     level = levels[-1]
     shown = _Shown.of(level, *repeats)
-    compared = _compare_shifts(pyramid, periods, start_px, guess, spread, noise, shown)
-    if isinstance(compared, Rejection):
-        return compared
+    first = _refine_first(pyramid, start_px, noise, shown)
+    if isinstance(first, Rejection):
+        return first
+    shifts = [*_list_shifts(first.shift_px, periods, guess, spread, level.size)]
+    if shown.is_all:
+        # The highest correlation is no tool's.
+        shifts.append(highest_px)
+    compared = _compare_shifts(pyramid, shifts, noise, shown)
     if not compared:
         return Rejection(MatchFailure.NOT_CONVERGED, "refinement did not converge at any period")
 
@@ -200,6 +211,12 @@ def choose_period(
     if best.is_held:
         return Rejection(
             MatchFailure.AMBIGUOUS, "ambiguous: lines, whose defects do not tell a place along them"
+        )
+    if _leaves_structure(best, noise):
+        return Rejection(
+            MatchFailure.AMBIGUOUS,
+            f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, of which no shift that was "
+            "compared explains the image",
         )
     predicted = _find_predicted(compared, periods, guess, spread, level.size)
     if predicted is not None and (predicted is best or not _tells(best, predicted, EVIDENCE_MIN)):
@@ -223,20 +240,10 @@ def choose_period(
 
 
 def _compare_shifts(
-    pyramid: Pyramid,
-    periods: Array,
-    start_px: Array,
-    guess: Array,
-    spread: Array | None,
-    noise: TileNoise,
-    shown: _Shown,
-) -> list[_Candidate] | Rejection[MatchFailure]:
-    """The shifts of the class, each refined by what shows the lattice."""
+    pyramid: Pyramid, shifts: Sequence[Array], noise: TileNoise, shown: _Shown
+) -> list[_Candidate]:
+    """Shifts of the class, each refined by what shows the lattice."""
     level = shown.level
-    first = _refine_first(pyramid, start_px, noise, shown)
-    if isinstance(first, Rejection):
-        return first
-    shifts = _list_shifts(first.shift_px, periods, guess, spread, level.size)
     compared: list[_Candidate] = []
     for shift in shifts:
         found = _refine(pyramid, shift, noise, shown)
@@ -397,9 +404,26 @@ def _tells(first: _Candidate, second: _Candidate, least: float) -> bool:
 
 
 def _is_worse_everywhere(first: _Candidate, second: _Candidate) -> bool:
-    """Whether the first of two shifts leaves more of the structure than the second in nearly all tiles."""
-    excess = (first.energies - second.energies) / np.maximum(second.structure, 1e-30)
-    own = excess[np.isfinite(excess) & first.counted & second.counted]
+    """Whether the first of two shifts leaves more of the structure than the second in most tiles."""
+    return _are_left(first.energies - second.energies, second, first.counted)
+
+
+def _leaves_structure(candidate: _Candidate, noise: TileNoise) -> bool:
+    """Whether a shift leaves more in most tiles than noise that is known to a factor of two, and some of them would
+    rather move: another focus alone leaves as much, and moves nothing.
+    """
+    expected = NOISE_DOUBT * (noise.image + noise.reference)
+    if not _are_left(candidate.energies - expected, candidate, candidate.counted):
+        return False
+    tiles = candidate.alignment.tile_statistics()
+    assert tiles is not None
+    return not find_agreement(tiles, noise).is_complete
+
+
+def _are_left(excess: Array, candidate: _Candidate, counted: Mask) -> bool:
+    """Whether an excess (rows, cols) of squared residuals is a part of the structure in most of the counted tiles."""
+    relative = excess / np.maximum(candidate.structure, 1e-30)
+    own = relative[np.isfinite(relative) & counted & candidate.counted]
     if len(own) < DISORDERED_TILES_MIN:
         return False
     return float(np.mean(own > DISORDER_MIN)) >= DISORDERED_SHARE_MIN

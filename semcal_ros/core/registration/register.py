@@ -552,6 +552,7 @@ def _register(
             pyramid,
             reference.periods,
             np.array(start.shift_px),
+            np.array(finest[0].shift_px),
             guess,
             spread,
             noise_beside_tools(reference, pyramid),

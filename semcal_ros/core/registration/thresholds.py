@@ -395,13 +395,17 @@ DISORDER_MIN = TABLE.stated(
     "(median), a perfect lattice up to 0.019, by the interpolation of sharp edges.",
 )
 DISORDERED_SHARE_MIN = TABLE.stated(
-    "DISORDERED_SHARE_MIN", 0.75, "of the tiles",
+    "DISORDERED_SHARE_MIN", 0.5, "of the tiles",
     "In which it does: 0.88 of such a lattice, at most 0.22 of perfect ones with periods of 10 to 24 px.",
 )
 DISORDERED_TILES_MIN = TABLE.derived(
     "DISORDERED_TILES_MIN", 30, "tiles",
-    "Of which three quarters are worse by chance, where half would be, once in 380 pairs of shifts (binomial); by "
-    "that part of the structure more seldom.",
+    "Of a perfect lattice, with 0.22 of them beyond the limit, half are so once in 1500 pairs of shifts (binomial).",
+)
+NOISE_DOUBT = TABLE.stated(
+    "NOISE_DOUBT", 2.0, "of the noise",
+    "That is taken off what a shift leaves before it is compared with the structure: noise is measured where it is "
+    "least, and bright parts have more.",
 )
 ALONG_STARTS_PX = TABLE.cost(
     "ALONG_STARTS_PX", (-0.6, 0.6, -1.2, 1.2), "px",

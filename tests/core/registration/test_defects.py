@@ -240,3 +240,25 @@ def test_a_plain_grating_tells_no_place_along_it(period: float) -> None:
     ]
     found = compare(*pair, np.array([0.4, -0.3]), 0.5)
     assert not found.accepted or found.along is not None
+
+
+@pytest.mark.parametrize("periods", [1, 2, 3])
+def test_a_prediction_does_not_hide_a_jump_of_a_disordered_coarse_lattice(periods: int) -> None:
+    """Of periods that are a good part of the field, a prediction decides, but not against the picture."""
+    pitch, drift = 16.0, np.array([0.4, -0.3])
+    shift = drift + [periods * pitch, 0.0]
+    pair = draw_pores(pitch, 0.05, np.zeros(2)), draw_pores(pitch, 0.05, shift)
+    found = compare(*pair, drift, 0.5)
+    # What is farther than all that is compared may be refused.
+    assert found.accepted or periods == 3, found.reason
+    if found.accepted:
+        np.testing.assert_allclose(found.shift_px, shift, atol=0.06)
+
+
+def test_a_lattice_in_another_focus_still_tells_its_shift() -> None:
+    drift = np.array([0.4, -0.3])
+    first, second = (lattice(SIZE, 16.0, (float(x), float(y))) for x, y in (np.zeros(2), drift))
+    blurred = cv2.GaussianBlur(second, (0, 0), 3.0)
+    found = compare(first, blurred, drift, 0.5)
+    assert found.accepted, found.reason
+    np.testing.assert_allclose(found.shift_px, drift, atol=0.06)
