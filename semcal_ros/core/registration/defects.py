@@ -208,19 +208,12 @@ def choose_period(
             pro < contra and not _is_worse_everywhere(other, best)
         ):
             best = other
-    if best.is_held:
-        return Rejection(
-            MatchFailure.AMBIGUOUS, "ambiguous: lines, whose defects do not tell a place along them"
-        )
-    if _leaves_structure(best, noise):
-        return Rejection(
-            MatchFailure.AMBIGUOUS,
-            f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, of which no shift that was "
-            "compared explains the image",
-        )
     predicted = _find_predicted(compared, periods, guess, spread, level.size)
     if predicted is not None and (predicted is best or not _tells(best, predicted, EVIDENCE_MIN)):
-        return _leave_out(pyramid, predicted, noise, shown)
+        return _find_flaw(predicted, periods, noise) or _leave_out(pyramid, predicted, noise, shown)
+    flaw = _find_flaw(best, periods, noise)
+    if flaw is not None:
+        return flaw
     least = _find_least_evidence(best, noise)
     x, y = best.shift_px.tolist()
     for other in compared:
@@ -237,6 +230,22 @@ def choose_period(
             f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, and only one shift to compare",
         )
     return _leave_out(pyramid, best, noise, shown)
+
+
+def _find_flaw(
+    chosen: _Candidate, periods: Array, noise: TileNoise
+) -> Rejection[MatchFailure] | None:
+    """Why a shift is not that of the specimen, whatever the others are; None if nothing speaks against it."""
+    if chosen.is_held:
+        reason = "ambiguous: lines, whose defects do not tell a place along them"
+    elif _leaves_structure(chosen, noise):
+        reason = (
+            f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, of which no shift that was "
+            "compared explains the image"
+        )
+    else:
+        return None
+    return Rejection(MatchFailure.AMBIGUOUS, reason)
 
 
 def _compare_shifts(
@@ -358,14 +367,16 @@ def _find_predicted(
     spread: Array | None,
     size: tuple[int, int],
 ) -> _Candidate | None:
-    """The shift that a prediction tells; None where the lattice is fine, or the prediction not good enough."""
+    """The shift that a prediction tells; None where the lattice is fine, or the prediction not good enough. One that
+    was not refined along lines is none.
+    """
     if spread is None or is_fine(periods, size):
         return None
     shortest = float(np.min(np.hypot(*periods.T)))
     sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
     if HALF_PERIOD_SIGMAS * sigma > 0.5 * shortest:
         return None
-    distances = [float(np.hypot(*(c.shift_px - guess))) for c in compared]
+    distances = [np.inf if c.is_held else float(np.hypot(*(c.shift_px - guess))) for c in compared]
     nearest = int(np.argmin(distances))
     return compared[nearest] if distances[nearest] < 0.25 * shortest else None
 
