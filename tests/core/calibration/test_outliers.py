@@ -243,6 +243,15 @@ def test_a_jump_counts_in_what_scales_scatter_by(residual, factor):
             assert jump.sigma == pytest.approx(sigma)
 
 
+def test_a_magnification_whose_scale_nothing_tells_is_no_jump():
+    problem, result = _adjusted(GROUP, 1.0, pull=np.array([0.0, 0.0, 1.0, 1.0]), weight=1e6)
+    blind = result.information.copy()
+    blind[1] = 0.0
+    constant = {"scale": ContinuousFunction("chebyshev_log", np.ones(1), (100.0, 3000.0))}
+    adjustment = Adjustment(constant, problem, replace(result, information=blind), None, 1, True)
+    assert find_change_point(SETUP, adjustment) is None
+
+
 @pytest.mark.parametrize(("height_m", "odd"), [(35e-6, False), (45e-6, True)])
 def test_heights_that_differ_by_micrometres_are_alike_however_small_the_spread(height_m, odd):
     heights = np.zeros(24)

@@ -127,7 +127,11 @@ def find_change_point(setup: Setup, adjustment: Adjustment) -> ChangePoint | Non
     candidates += [(g[k], g[k], index == k) for k in range(1, len(g) - 1)]
     own = columns_of(adjustment.functions)["scale"]
     smooth = adjustment.problem.designs[:, 0, own] / setup.nominal_px_per_m(g)[:, None]
-    scales = _free_scales(setup, adjustment)
+    try:
+        scales = _free_scales(setup, adjustment)
+    except np.linalg.LinAlgError:
+        # By itself, the scale of a magnification is not determined.
+        return None
     found = find_change(scales, smooth, [where for _, _, where in candidates])
     if found is None:
         return None
