@@ -76,7 +76,7 @@ class DriftProcess:
 
     The process is started by the first request, which takes a second or two, and again by the first request after it
     has died. Futures raise what the tracker raised, or :class:`ChildProcessEnded` if the process has died; the
-    tracker is lost then.
+    tracker is lost then. After :meth:`close`, all futures raise that.
     """
 
     def __init__(self) -> None:
@@ -101,11 +101,11 @@ class DriftProcess:
     ) -> Future[Measurement]:
         """Measure a frame, from now on with ``tracker``; None stands for the tracker that the process has."""
         frame = _Frame(image, camera, time_s, timing)
-        return self._queue.submit(self._ask, tracker, frame)
+        return self._submit(tracker, frame)
 
     def fetch(self) -> Future[DriftTracker]:
         """Request the tracker in its state after all earlier requests."""
-        return self._queue.submit(self._ask, None, None)
+        return self._submit(None, None)
 
     def close(self) -> None:
         """End the process."""
@@ -117,6 +117,17 @@ class DriftProcess:
         self._queue.shutdown(wait=True)
         if self._process is not None:
             self._process.close()
+
+    def _submit(self, tracker: DriftTracker | None, frame: _Frame | None) -> Future[Any]:
+        try:
+            return self._queue.submit(self._ask, tracker, frame)
+        except RuntimeError:
+            if not self._ended:
+                raise
+            # A node that ends may still be at work on a frame.
+            none: Future[Any] = Future()
+            none.set_exception(ChildProcessEnded(None))
+            return none
 
     def _ask(self, tracker: DriftTracker | None, frame: _Frame | None) -> Any:
         if self._process is None and not self._ended:
