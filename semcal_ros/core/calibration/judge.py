@@ -214,23 +214,26 @@ class CalibrationResult:
         return tuple(own.sentence(self.model) for own in rank_findings(self.findings, self.model))
 
 
+def _name_views_at(setup: Setup, g: float) -> str:
+    return " and ".join(v.name for v in setup.views if v.magnification == g)
+
+
 def _name_few_beside(setup: Setup, change: ChangePoint) -> str:
     """Return that the few views beside a jump may have a wrong magnification, or nothing if they are not few."""
     counts = Counter(v.magnification for v in setup.views)
     least = min((change.below, change.above), key=lambda g: counts[g])
     if counts[least] >= min(VIEWS_MIN, float(np.median(list(counts.values())))):
         return ""
-    names = " and ".join(v.name for v in setup.views if v.magnification == least)
+    names = _name_views_at(setup, least)
     return f"look first whether {names} was taken at {least:g}, where there are fewer views than elsewhere; else, "
 
 
 def _describe_change(setup: Setup, change: ChangePoint) -> Finding:
     size = f"by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} %"
     if change.below == change.above:
-        names = " and ".join(v.name for v in setup.views if v.magnification == change.below)
         text = (
             f"the scale at magnification {change.below:g} departs {size} from what the others lead to expect: look "
-            f"whether {names} was taken at {change.below:g}"
+            f"whether {_name_views_at(setup, change.below)} was taken at {change.below:g}"
         )
         return Finding(text, cost_relative=change.relative, magnification=change.below)
     text = (

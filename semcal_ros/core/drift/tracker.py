@@ -240,11 +240,12 @@ def _look_for_fixed(
         return state, False
     pulled = np.linalg.solve(px_from_unit, pulled_px)
     squares = pulled @ np.linalg.solve(state.filter.state.covariance[:2, :2], pulled)
-    if squares < FIXED_PULL_MIN**2:
-        return clean_keyframes(setup, state), False
-    widened = state.filter.widen_measurements(np.outer(pulled, pulled))
-    # The frame is measured once more, and is no repeated one.
-    return clean_keyframes(setup, replace(state, filter=widened, sample=b"")), True
+    is_pulled = bool(squares >= FIXED_PULL_MIN**2)
+    if is_pulled:
+        widened = state.filter.widen_measurements(np.outer(pulled, pulled))
+        # The frame is measured once more, and is no repeated one.
+        state = replace(state, filter=widened, sample=b"")
+    return clean_keyframes(setup, state), is_pulled
 
 
 def _follow_without_stripes(

@@ -252,14 +252,14 @@ def _compare_shifts(
     pyramid: Pyramid, shifts: Sequence[Array], noise: TileNoise, shown: _Shown
 ) -> list[_Candidate]:
     """Shifts of the class, each refined by what shows the lattice."""
-    level = shown.level
+    level, along = shown.level, _along_lines(shown.level)
     compared: list[_Candidate] = []
     for shift in shifts:
         found = _refine(pyramid, shift, noise, shown)
         is_held = isinstance(found, Rejection) or not found.converged
         if is_held and shown.is_all:
             # Of lines, only defects tell the place along them, which are elsewhere.
-            found = align([level], pyramid, shift, held=_along_lines(level))
+            found = align([level], pyramid, shift, held=along)
         if isinstance(found, Rejection) or not found.converged:
             continue
         if any(np.max(np.abs(found.shift_px - c.shift_px)) < SAME_SHIFT_PX for c in compared):

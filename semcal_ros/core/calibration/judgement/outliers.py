@@ -125,6 +125,8 @@ def find_change_point(setup: Setup, adjustment: Adjustment) -> ChangePoint | Non
     ]
     # The lowest or the highest one alone is a step, too.
     candidates += [(g[k], g[k], index == k) for k in range(1, len(g) - 1)]
+    if not candidates:
+        return None
     own = columns_of(adjustment.functions)["scale"]
     smooth = adjustment.problem.designs[:, 0, own] / setup.nominal_px_per_m(g)[:, None]
     try:
@@ -156,14 +158,14 @@ def find_change(
     smooth
         (M, K) values of the functions whose sum is the smooth one.
     candidates
-        (M,) where the scale is changed, for each.
+        (M,) where the scale is changed, for each; at least one.
 
     Returns
     -------
     Index of the candidate, relative size of the change and its 1-sigma, or None if none is significant.
     """
     freedom = len(smooth) - smooth.shape[1] + scales.repeated
-    if not candidates or freedom <= 0.0:
+    if freedom <= 0.0:
         return None
     basis = np.linalg.qr(scales.whiten(smooth))[0]
     left = scales.whiten(scales.departure)
