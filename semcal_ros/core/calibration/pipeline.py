@@ -57,6 +57,7 @@ from semcal_ros.core.calibration.judgement.outliers import (
     find_wrong_tilts,
     measure_deviations,
 )
+from semcal_ros.core.calibration.judgement.thresholds import TILT_SIGMAS
 from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.paper.methods import fit_separately
@@ -65,6 +66,7 @@ from semcal_ros.core.calibration.solve import JointFit, solve
 from semcal_ros.core.calibration.stage import (
     OFFSET_NAMES,
     StageAxis,
+    attitude_residuals,
     attitudes,
     stage_rotations,
 )
@@ -356,15 +358,16 @@ def _fit_without_outliers(
     Also returns those views, and a finding for each reading.
     """
     outliers: list[RejectedView] = []
-    notes: list[Finding] = []
+    notes: dict[str, Finding] = {}
     given = {view.name: view for view in setup.views}
+    believed_again: set[str] = set()
     while True:
         fit = fit_joint(setup, residual, on_stage)
         wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
         found = _find_outlier_of_few(setup) if wrong or _is_irregular(setup, fit) else {}
         if wrong and not found:
             setup, own = _without_tilts(setup, wrong)
-            notes += own
+            notes |= own
             continue
         found = (
             found
@@ -374,16 +377,23 @@ def _fit_without_outliers(
             )
         )
         if not found:
-            notes += _find_turned_axis(given, setup, fit)
-            return fit, setup, tuple(outliers), notes
+            again = _find_agreeing_tilts(given, setup, fit, set(notes) - believed_again)
+            if again:
+                believed_again.update(again)
+                views = tuple(given[v.name] if v.name in again else v for v in setup.views)
+                setup = add_shared_unknowns(replace(setup, views=views))
+                notes = {name: note for name, note in notes.items() if name not in again}
+                continue
+            turned = _find_turned_axis(given, setup, fit)
+            return fit, setup, tuple(outliers), [*notes.values(), *turned]
         outliers += [
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
             for v, rejection in found.items()
         ]
-        # Fewer views at every turn, so this loop ends.
+        # Views become fewer, and a reading is believed again once, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         if not views:
-            return fit, setup, tuple(outliers), notes
+            return fit, setup, tuple(outliers), list(notes.values())
         # A magnification of which no view is left is not calibrated.
         magnifications = np.unique([v.magnification for v in views])
         setup = replace(setup, views=views, magnifications=magnifications)
@@ -435,6 +445,31 @@ def _worst_sigma(setup: Setup, fit: MethodFit) -> float:
         for camera in (model.at(float(g)) for g in setup.magnifications)
     ]
     return float(np.max(sigmas))
+
+
+def _find_agreeing_tilts(
+    given: Mapping[str, GridView], setup: Setup, fit: JointFit, refused: set[str]
+) -> set[str]:
+    """Return which of the views whose tilts were refused agree with the stage as the others know it.
+
+    A wrong reading moves the constant offsets of the stage, and a sound one may be refused with it. What the pose of
+    such a view is uncertain by does not count for it: a reading that agrees by chance alone stays refused.
+    """
+    chosen = [k for k, v in enumerate(setup.views) if v.name in refused]
+    problem, state = fit.adjustment.problem, fit.adjustment.result.state
+    if not chosen or problem.attitudes is None:
+        return set()
+    views = [given[setup.views[k].name] for k in chosen]
+    known = attitudes(
+        [v.stage for v in views],
+        [v.untilted for v in views],
+        setup.axis,
+        setup.priors.untilted_sigma_rad,
+    )
+    offsets = problem.shared_values(state.theta, OFFSET_NAMES)
+    left, _, _ = attitude_residuals(known, offsets, state.rotations[chosen])
+    agrees = np.max(np.abs(left), axis=1) <= TILT_SIGMAS
+    return {v.name for v, own in zip(views, agrees, strict=True) if own}
 
 
 def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit) -> list[Finding]:
@@ -535,17 +570,15 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
     return {best: deviations.reject(best)}
 
 
-def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, list[Finding]]:
-    """Return the setup without the tilts of some views, and a finding for each of them."""
-    views, notes = list(setup.views), []
+def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, dict[str, Finding]]:
+    """Return the setup without the tilts of some views, and a finding for each of them by its name."""
+    views, notes = list(setup.views), {}
     for index, sigmas in wrong.items():
         view = views[index]
         told = "the tilt of the stage" if view.stage is not None else "untilted"
-        notes.append(
-            Finding(
-                f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
-                f"{sigmas:.0f} sigma; its tilt is not used"
-            )
+        notes[view.name] = Finding(
+            f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
+            f"{sigmas:.0f} sigma; its tilt is not used"
         )
         views[index] = replace(view, stage=None, untilted=False)
     return add_shared_unknowns(replace(setup, views=tuple(views))), notes

@@ -223,6 +223,20 @@ def test_a_tilt_that_contradicts_the_image_is_named_and_not_used():
     assert abs(estimated(result, "axis_y_m", truth[1])) < 3.0
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_wrong_tilt_takes_no_sound_one_with_it(seed):
+    """Of four views, the next tilt contradicts the offsets that the wrong one has moved by 5 sigmas and more."""
+    stage = replace(ONE_AXIS, tilts_rad=(0.0, 0.2, 0.35, 0.5), reading_sigma_rad=0.003)
+    views = stage_views(
+        MICROSCOPE.camera_at, (1000.0,), stage, most_corners=130, seed=seed, readings=True
+    )
+    wrong = replace(views[2], stage=replace(views[2].stage, tilt_rad=views[2].stage.tilt_rad - 0.1))
+    result = calibrated([*views[:2], wrong, views[3]], axis=StageAxis(0.2))
+    (note,) = (note for note in scale_notes(result) if "contradicts" in note)
+    assert f"view {wrong.name} at magnification" in note
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_an_axis_the_wrong_way_round_is_said():
