@@ -101,6 +101,15 @@ class Calibration(CalibrationModel):
         write_calibration(self, path)
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was suspicious when it was made, the costliest first; empty where a file does not say."""
+        # The statistics in a file are notes, which may have been edited.
+        listed = self.statistics.get("warnings")
+        if not isinstance(listed, (list, tuple)):
+            return ()
+        return tuple(text for text in listed if isinstance(text, str))
+
+    @property
     def equations(self) -> tuple[FittedEquation, ...]:
         """The differential equation of each parameter, of method ``"pda"``; empty for the others."""
         # Here, so that those who only ask for a camera do not wait for the calibration's modules.
@@ -196,12 +205,14 @@ class Calibration(CalibrationModel):
         if "views" in facts:
             texts.append(counted(int(facts["views"]), "view"))
         texts += [f"{name} {facts[name]}" for name in ("RMS", "held-out RMS") if name in facts]
+        if self.warnings:
+            texts.append(counted(len(self.warnings), "warning"))
         return f"Calibration({', '.join(texts)})"
 
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><th style='text-align:left'>{name}</th><td>{escape(text)}</td></tr>"
-            for name, text in self._facts()
+            for name, text in [*self._facts(), *(("warning", text) for text in self.warnings)]
         )
         return f"<table><caption>Calibration</caption>{rows}</table>"
 

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from html import escape
 
 import cv2
 import numpy as np
@@ -62,18 +63,29 @@ def test_a_calibration_with_another_number_is_another_one(calibration):
 def test_its_text_is_one_line_of_what_matters(calibration):
     text = repr(calibration)
     assert text.startswith("Calibration(joint, 500x to 4000x, 512 x 512 px, 12 views, RMS 0.0")
-    assert "held-out RMS 0." in text and text.endswith(" px)")
-    assert "\n" not in text and len(text) < 120
+    assert "held-out RMS 0." in text
+    count = len(calibration.warnings)
+    assert count > 0 and text.endswith(f" px, {count} warning{'s' if count > 1 else ''})")
+    assert "\n" not in text and len(text) < 130
 
 
 def test_its_table_holds_the_same(calibration):
     table = calibration._repr_html_()
-    assert table.count("<tr>") == 6
+    assert table.count("<tr>") == 6 + len(calibration.warnings)
+    for text in calibration.warnings:
+        assert f"<td>{escape(text)}</td>" in table
     for cell in ("500x to 4000x", "512 x 512 px", "<td>12</td>", "held-out RMS"):
         assert cell in table
     edited = Calibration.from_model(replace(calibration, method="<b>", statistics={"views": "no"}))
     assert "<b>" not in edited._repr_html_()
     assert repr(edited) == "Calibration(<b>, 500x to 4000x, 512 x 512 px)"
+
+
+@pytest.mark.parametrize("noted", ["text", 3, None, {"a": "b"}, [1, None]])
+def test_notes_that_are_no_list_of_texts_are_no_warnings(calibration, noted):
+    edited = Calibration.from_model(replace(calibration, statistics={"warnings": noted}))
+    assert edited.warnings == ()
+    assert "warning" not in repr(edited) + edited._repr_html_()
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array, iter])

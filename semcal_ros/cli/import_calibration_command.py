@@ -47,5 +47,5 @@ def command(table: Path, output: Path, options: ImportOptions) -> None:
         f"{counted(len(made.magnifications), 'magnification')}, display width {made.display_width_m:.6g} m"
     )
     click.echo(f"calibration: {output}")
-    for warning in made.statistics["warnings"]:
+    for warning in made.warnings:
         click.echo(f"warning: {warning}", err=True)
