@@ -41,7 +41,6 @@ from semcal_ros.core.calibration.start import check_nominal_scale, check_square_
 from semcal_ros.core.calibration.thresholds import VIEWS_MIN
 from semcal_ros.core.calibration.views import (
     FoundView,
-    GridView,
     RejectedView,
     SquareAssignment,
     assign_squares,
@@ -125,10 +124,6 @@ class RecordingCalibration:
     notes: tuple[str, ...] = ()
 
 
-# One wrong reading in two leaves it open which of them are the wrong ones.
-_MOST_REFUSED = 0.5
-
-
 def _check_scale(assignment: SquareAssignment, found: Sequence[FoundView], width_m: float) -> None:
     """Refuse views whose scale is far from what their magnifications, on this display, predict."""
     sizes_m = {width_m / (v.magnification * v.detection.image_size[0]) for v in found}
@@ -189,22 +184,6 @@ def _check_stated_scale(collected: CollectedViews) -> None:
         do=advice
         + "; where the stated pixel sizes mean nothing, give --display-width or --magnification instead",
     )
-
-
-def _find_contradiction(views: Sequence[GridView], result: CalibrationResult) -> list[Finding]:
-    """Return a finding if the calibration refused the tilts of most views that have one, else nothing."""
-    stated = {v.name for v in views if v.stage is not None and v.stage.tilt_rad is not None}
-    refused = sum(v.name in stated and v.stage is None for v in result.views)
-    if refused <= _MOST_REFUSED * len(stated):
-        return []
-    # The tilts that were not refused are wrong too, by less; they have pulled the scale with them.
-    return [
-        Finding(
-            f"scale: {refused} of {counted(len(stated), 'view')} contradict the tilt of the stage: the stage is not "
-            "used; check the unit of its angles, its rotation, its stamps, and the direction of its tilt axis "
-            "(stage.tilt_axis_deg)"
-        )
-    ]
 
 
 def _remove_outliers(collected: CollectedViews, result: CalibrationResult) -> CollectedViews:
@@ -298,31 +277,25 @@ def calibrate_found(
         _check_stated_scale(collected)
     check_square_sides(factor, display_width_m)
 
-    def calibrated(views: Sequence[GridView]) -> CalibrationResult:
-        try:
-            return calibrate_views(
-                views,
-                image_size=collected.image_size,
-                display_width_m=display_width_m,
-                options=options,
-                on_stage=lambda name, part: on_stage(name, 0.95 * part),
-            )
-        except SemcalError:
-            raise
-        except _NUMERIC as error:
-            raise CalibrationError(
-                f"views that cannot be solved for ({type(error).__name__}: {error})",
-                expected="views of a grid from different directions",
-                do="add tilted views, or leave out those that differ from the others",
-            ) from error
-
-    result = calibrated(collected.views)
-    contradiction = _find_contradiction(collected.views, result)
-    if contradiction:
-        result = calibrated([replace(view, stage=None) for view in collected.views])
+    try:
+        result = calibrate_views(
+            collected.views,
+            image_size=collected.image_size,
+            display_width_m=display_width_m,
+            options=options,
+            on_stage=lambda name, part: on_stage(name, 0.95 * part),
+        )
+    except SemcalError:
+        raise
+    except _NUMERIC as error:
+        raise CalibrationError(
+            f"views that cannot be solved for ({type(error).__name__}: {error})",
+            expected="views of a grid from different directions",
+            do="add tilted views, or leave out those that differ from the others",
+        ) from error
     on_stage("summary", 0.95)
     collected = _remove_outliers(collected, result)
-    known = [*contradiction, *result.findings]
+    known = list(result.findings)
     if not 1.0 / _SCALE_WARNING < factor < _SCALE_WARNING:
         known.append(
             Finding(

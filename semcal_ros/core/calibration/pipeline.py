@@ -158,6 +158,13 @@ def calibrate_views(
         _check_converged(setup, fit, factor)
         return judge(setup, fit, options, None, ())
     joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+    contradiction = _find_contradicted_stage(views, setup)
+    if contradiction:
+        given = {view.name: view for view in views}
+        bare = [replace(view, stage=None) for view in views]
+        setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
+        joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+        notes += [*contradiction, *_find_turned_axis(given, setup, joint)]
     notes += lines
     fit = describe_fit(setup, joint)
     if options.untilted == "auto":
@@ -355,7 +362,8 @@ def _fit_without_outliers(
 ) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[Finding]]:
     """Fit without the views, and the readings of tilts, that disagree with the others.
 
-    Also returns those views, and a finding for each reading.
+    Also returns those views, and a finding for each reading. It ends before that where the views contradict most of the
+    stage's tilts, since those that are left are wrong as well, by less.
     """
     outliers: list[RejectedView] = []
     notes: dict[str, Finding] = {}
@@ -368,6 +376,8 @@ def _fit_without_outliers(
         if wrong and not found:
             setup, own = _without_tilts(setup, wrong)
             notes |= own
+            if _find_contradicted_stage(list(given.values()), setup):
+                return fit, setup, tuple(outliers), list(notes.values())
             continue
         found = (
             found
@@ -470,6 +480,21 @@ def _find_agreeing_tilts(
     left, _, _ = attitude_residuals(known, offsets, state.rotations[chosen])
     agrees = np.max(np.abs(left), axis=1) <= TILT_SIGMAS
     return {v.name for v, own in zip(views, agrees, strict=True) if own}
+
+
+def _find_contradicted_stage(given: Sequence[GridView], setup: Setup) -> list[Finding]:
+    """Return a finding if the tilts of most views that have one were refused."""
+    told = {v.name for v in given if v.has_stage_tilt}
+    refused = sum(v.name in told and v.stage is None for v in setup.views)
+    if refused <= REFUSED_PART * len(told):
+        return []
+    return [
+        Finding(
+            f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: the stage is not "
+            "used; check the unit of its angles, its rotation, its stamps, and the direction of its tilt axis "
+            "(stage.tilt_axis_deg)"
+        )
+    ]
 
 
 def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit) -> list[Finding]:

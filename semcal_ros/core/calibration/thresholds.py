@@ -139,7 +139,8 @@ WORTHWHILE_PART = TABLE.stated(
 )
 REFUSED_PART = TABLE.stated(
     "REFUSED_PART", 0.5, "of the tilts",
-    "That are refused, from which the axis may be wrong, and not the tilts.",
+    "That are refused, from which the axis may be wrong, and not the tilts; beyond it, the stage is not used: one "
+    "wrong reading in two leaves it open which of them are the wrong ones.",
 )
 NEARER_PART = TABLE.stated(
     "NEARER_PART", 0.3, "of the angle",

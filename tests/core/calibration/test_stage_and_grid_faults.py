@@ -245,6 +245,32 @@ def test_an_axis_the_wrong_way_round_is_said():
     assert any("add 180 to stage.tilt_axis_deg" in note for note in scale_notes(result))
 
 
+@pytest.mark.long
+def test_a_stage_that_most_views_contradict_is_left_out_at_once():
+    """A rotation that is read as none, of a grid that lies otherwise in each view."""
+    stage = replace(ONE_AXIS, tilts_rad=(0.0, 0.25, 0.45, 0.25), reading_sigma_rad=0.003)
+    views = stage_views(
+        MICROSCOPE.camera_at, (1000.0, 2000.0), stage, most_corners=130, seed=1, readings=True
+    )
+    read = [replace(v, stage=replace(v.stage, rotation_rad=0.0)) for v in views]
+    stages: list[str] = []
+    result = calibrate_views(
+        read,
+        image_size=MICROSCOPE.image_size,
+        display_width_m=MICROSCOPE.display_width_m,
+        options=CalibrationOptions(axis=StageAxis(0.2)),
+        on_stage=lambda name, _part: stages.append(name),
+    )
+    (note,) = (note for note in scale_notes(result) if "contradict" in note)
+    assert "of 8 views contradict the tilt of the stage: the stage is not used" in note
+    assert not any(view.has_stage_tilt for view in result.views)
+    # Twice with the stage, since only half of the tilts stand out beside all the others, and once without. Which of the
+    # rest are wrong is not asked: that takes a fourth.
+    assert stages.count("start values") <= 3
+    plain = calibrated([replace(view, stage=None) for view in views])
+    np.testing.assert_array_equal(result.model.at(1500.0).P, plain.model.at(1500.0).P)
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_constant_error_of_the_stage_beyond_belief_is_said():
