@@ -60,8 +60,9 @@ def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     """Predict the (n,) 1-sigma, px, of positions relative to the image centre, worse axis.
 
     The points lie in the reference plane and are seen at ideal pixels ``xy``. A common shift of the
-    image drops out: it trades off against the position of the specimen, which no measurement
-    within one image needs.
+    specimen drops out, the one that keeps in place what is seen at the centre: no measurement within
+    one image needs its position. A shift of the image instead would leave what the distortion does
+    to it, and count that the principal point is uncertain.
     """
     covariance = camera.joint_covariance
     if covariance is None:
@@ -69,7 +70,12 @@ def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     centre = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
     points = camera.sem_from_ideal(np.concatenate([centre, xy]))
     jacobian = camera.project_jacobian(points)
-    return _compute_larger_sigma(jacobian[1:] - jacobian[:1], covariance)
+    moved = project_points_with_jacobians(camera.parameters, points, camera.raster).d_xyz[:, :, :2]
+    # Where nothing is seen at the centre, nothing is relative to it.
+    shift = np.full((2, jacobian.shape[2]), np.nan)
+    if np.all(np.isfinite(moved[0])) and np.all(np.isfinite(jacobian[0])):
+        shift = np.linalg.solve(moved[0], jacobian[0])
+    return _compute_larger_sigma(jacobian[1:] - moved[1:] @ shift, covariance)
 
 
 def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:

@@ -135,6 +135,10 @@ def test_shape_sigma_ignores_the_principal_point_but_not_the_scale() -> None:
     corner = np.array([[0.0, 0.0]])
     # Without distortion, a shift is the same everywhere.
     assert predict_shape_sigma_px(camera, corner)[0] == pytest.approx(0.0, abs=1e-9)
+    # With it, the specimen is shifted back to where it is distorted as before.
+    distorted = replace(camera_at(400.0), covariance=covariance)
+    assert distorted.xi_r != 0.0
+    assert predict_shape_sigma_px(distorted, corner)[0] == pytest.approx(0.0, abs=1e-9)
     covariance = np.zeros((10, 10))
     covariance[0, 0] = (1e-3 * camera.m) ** 2
     scaled = replace(camera, covariance=covariance)

@@ -185,9 +185,12 @@ def _compare_at(first: ScanCamera, second: ScanCamera) -> DifferenceAt:
     ideal = first.undistort(np.concatenate([middle, xy]))
     known = np.all(np.isfinite(ideal), axis=1)
     moved = np.full_like(ideal, np.nan)
-    if known.any():
-        moved[known] = second.project(first.sem_from_ideal(ideal[known]))
-    difference = moved[1:] - xy - (moved[:1] - middle)
+    # What the first camera sees at the centre, the second one sees there when the specimen is shifted by so much.
+    there = second.undistort(middle)
+    if np.all(known[:1]) and np.all(np.isfinite(there)):
+        points = first.sem_from_ideal(ideal[known])
+        moved[known] = second.project(points + second.sem_from_ideal(there) - points[:1])
+    difference = moved[1:] - xy
     sigma = np.hypot(
         predict_shape_sigma_px(first, _finite(ideal[1:])),
         predict_shape_sigma_px(second, _finite(ideal[1:])),
