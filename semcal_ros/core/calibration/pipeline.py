@@ -160,12 +160,10 @@ def calibrate_views(
     joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
     contradiction = _find_contradicted_stage(views, setup)
     if contradiction:
-        given = {view.name: view for view in views}
         bare = [replace(view, stage=None) for view in views]
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
         joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
-        notes += [*contradiction, *_find_turned_axis(given, setup, joint)]
-    notes += lines
+    notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
     fit = describe_fit(setup, joint)
     if options.untilted == "auto":
         notes += _propose_untilted(setup, joint, fit)
@@ -394,8 +392,7 @@ def _fit_without_outliers(
                 setup = add_shared_unknowns(replace(setup, views=views))
                 notes = {name: note for name, note in notes.items() if name not in again}
                 continue
-            turned = _find_turned_axis(given, setup, fit)
-            return fit, setup, tuple(outliers), [*notes.values(), *turned]
+            return fit, setup, tuple(outliers), list(notes.values())
         outliers += [
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
             for v, rejection in found.items()
@@ -497,15 +494,13 @@ def _find_contradicted_stage(given: Sequence[GridView], setup: Setup) -> list[Fi
     ]
 
 
-def _find_turned_axis(given: Mapping[str, GridView], setup: Setup, fit: JointFit) -> list[Finding]:
+def _find_turned_axis(given: Sequence[GridView], setup: Setup, fit: JointFit) -> list[Finding]:
     """Return a finding if most tilts of the stage were refused, and are right about an axis the other way round."""
-    told = sum(v.has_stage_tilt for v in given.values())
-    refused = [
-        k for k, v in enumerate(setup.views) if v.stage is None and given[v.name].has_stage_tilt
-    ]
-    if len(refused) < max(REFUSED_PART * told, 1.0):
+    told = {v.name: v.stage for v in given if v.has_stage_tilt}
+    refused = [k for k, v in enumerate(setup.views) if v.stage is None and v.name in told]
+    if len(refused) < max(REFUSED_PART * len(told), 1.0):
         return []
-    readings = [given[setup.views[k].name].stage for k in refused]
+    readings = [told[setup.views[k].name] for k in refused]
     seen = fit.adjustment.result.state.rotations[refused, :, 2]
 
     def median_angle(axis: StageAxis) -> float:
