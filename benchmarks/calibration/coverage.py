@@ -67,6 +67,7 @@ CASES: Mapping[str, Case] = {
     "tilts in any direction": Case(ANY),
     "one tilt axis": Case(ONE),
     "one tilt axis, stage read": Case(READ, readings=True),
+    "one tilt of 17 degrees": Case(replace(ONE, tilts_rad=(0.3,) * 4)),
     "axis missed by 160 um": Case(replace(ONE, **MISSED)),
     "axis missed by 160 um, stage read": Case(replace(READ, **MISSED), readings=True),
     "height per visit 40 um": Case(replace(ANY, visit_height_sigma_m=4e-5)),

@@ -28,6 +28,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     Adjustment,
     refine,
 )
+from semcal_ros.core.calibration.estimator.common_tilt import common_tilt_covariance
 from semcal_ros.core.calibration.estimator.poses import (
     right_way_up,
     try_other_poses,
@@ -36,6 +37,7 @@ from semcal_ros.core.calibration.estimator.posterior import (
     CovarianceParts,
     PaddedAdjustment,
     pad,
+    pad_chosen,
     pad_covariance,
     pattern_covariance,
     split_covariance,
@@ -212,6 +214,10 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     covariance = pad_covariance(setup, padded, field)
     if selection.pattern is not None:
         covariance = covariance + pattern_covariance(setup, padded, selection.pattern)
+    common = pad_chosen(padded, common_tilt_covariance(adjustment))
+    parts = split_covariance(padded)
+    parts = replace(parts, visits=parts.visits + common)
+    covariance[: len(common), : len(common)] += common
     return JointFit(
         adjustment,
         padded,
@@ -219,5 +225,5 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         field,
         selection.pattern,
         selection.excess_px,
-        split_covariance(padded),
+        parts,
     )

@@ -477,6 +477,15 @@ def _left_out(chosen: Functions, padded: Functions) -> Indices:
     return np.array(out, dtype=np.intp)
 
 
+def pad_chosen(padded: PaddedAdjustment, covariance: Array) -> Array:
+    """Return a covariance of theta, with the coefficients that were chosen, as one of all coefficients."""
+    size = len(padded.result.state.theta) - len(padded.problem.shared)
+    chosen = np.setdiff1d(np.arange(size), _left_out(padded.chosen.functions, padded.functions))
+    whole = np.zeros((size, size))
+    whole[np.ix_(chosen, chosen)] = covariance[: len(chosen), : len(chosen)]
+    return whole
+
+
 def pattern_covariance(setup: Setup, padded: PaddedAdjustment, pattern: GridPattern) -> Array:
     """Return what an irregular grid adds to the covariance of the coefficients.
 

@@ -296,3 +296,41 @@ SPREAD_STEP_MAX = TABLE.cost(
     "SPREAD_STEP_MAX", 0.5, "log",
     "Of an extrapolation: from farther away, the updates are not linear.",
 )
+
+# A tilt that all views share, in common_tilt.py
+
+ALIKE_FORESHORTENING = TABLE.stated(
+    "ALIKE_FORESHORTENING", 0.02, "relative",
+    "Spread of what tilts shorten views by, below which they may not tell the tilt that is common to them. Where they "
+    "do, next to nothing is added: it costs time only to be too large.",
+)
+COMMON_TILT_CONFIDENCE = TABLE.derived(
+    "COMMON_TILT_CONFIDENCE", 0.99, "chance",
+    "That views of one tilt cost no more under it than under any other: two angles and a height of each then follow "
+    "from few numbers, each of which could save half a chi-square.",
+)
+PIVOT_HELD_PART = TABLE.cost(
+    "PIVOT_HELD_PART", 0.02, "of rho",
+    "To which it is held.",
+)
+PIVOT_RATIO = TABLE.derived(
+    "PIVOT_RATIO", 1.4, "of rho",
+    "Between the values that are tried: a tilt goes with its inverse, and what it shortens with the square of that.",
+)
+PIVOT_SIGMAS = TABLE.derived(
+    "PIVOT_SIGMAS", 3.0, "prior sigma",
+    "By which a camera is less likely beforehand than the most likely one, beyond which none is tried: 0.3 % of a "
+    "normal distribution.",
+)
+PIVOT_STEPS_MAX = TABLE.cost(
+    "PIVOT_STEPS_MAX", 12, "steps",
+    "To either side.",
+)
+PIVOT_ITERATIONS = TABLE.cost(
+    "PIVOT_ITERATIONS", 25, "steps",
+    "Of the adjustment with one rho.",
+)
+PIVOT_TOLERANCE = TABLE.stated(
+    "PIVOT_TOLERANCE", 0.05, "half chi-square",
+    "Decrease in one step that ends the adjustment with one rho: a tenth of what chance does to one number.",
+)

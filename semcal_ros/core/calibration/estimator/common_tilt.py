@@ -1,0 +1,137 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What views that are all tilted alike leave open.
+
+The perspective of a tilted view tells the product of its tilt and of the inverse pivot distance rho, and how much it is
+shortened tells its tilt and the aspect ratio together. Where the tilts differ, so do these, and each is told. Where all
+views have one tilt, about one axis of the image, nothing tells a tilt of 17 degrees from one of 6 before a scan that is
+4 % shorter in one direction. The adjustment then ends somewhere along a curve: at small tilts, since there a difference
+between the tilts of two views costs least. Its covariance is that of the tangent, which knows the scale to 0.4 %.
+
+So rho is held at values to either side, and the rest adjusted to each. Each that the views allow counts by what is
+known beforehand of the camera alone (the priors of rho, aspect ratio and skew): what the views prefer among them is how
+little their tilts and heights differ, which is no chance where a holder made them equal. The second moment about the
+adjustment is added to its covariance. The estimate stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    Adjustment,
+    refine,
+    variance_factor,
+)
+from semcal_ros.core.calibration.estimator.residuals import view_costs
+from semcal_ros.core.calibration.estimator.thresholds import (
+    ALIKE_FORESHORTENING,
+    COMMON_TILT_CONFIDENCE,
+    PIVOT_HELD_PART,
+    PIVOT_ITERATIONS,
+    PIVOT_RATIO,
+    PIVOT_SIGMAS,
+    PIVOT_STEPS_MAX,
+    PIVOT_TOLERANCE,
+)
+from semcal_ros.core.camera.calibration_model import columns_of
+
+
+def are_tilted_alike(rotations: Array) -> bool:
+    """Whether the tilts of views (V, 3, 3) shorten all of them alike, within :data:`ALIKE_FORESHORTENING`.
+
+    How much two views are shortened differently is seen whatever their common tilt is.
+    """
+    lean = rotations[:, :2, 2]
+    shortened = 0.5 * lean[:, :, None] * lean[:, None, :]
+    spread = np.sum(np.var(shortened, axis=0))
+    return bool(spread < ALIKE_FORESHORTENING**2)
+
+
+def _hold_pivot(problem: Problem, column: int, value: float, ratio: float) -> Problem:
+    """Return the problem with rho held at a value, and with heights that are larger by ``ratio``.
+
+    What is seen of a height is its product with rho, as of a tilt.
+    """
+    means, sigmas = problem.prior_mean.copy(), problem.prior_sigma.copy()
+    means[column], sigmas[column] = value, PIVOT_HELD_PART * value
+    held = replace(
+        problem,
+        prior_mean=means,
+        prior_sigma=sigmas,
+        height_sigma_m=ratio * problem.height_sigma_m,
+    )
+    effects = problem.effects
+    if effects is None:
+        return held
+    return replace(held, effects=replace(effects, height_sigma_m=ratio * effects.height_sigma_m))
+
+
+def common_tilt_covariance(adjustment: Adjustment) -> Array:
+    """Return the (K, K) covariance of theta that is added for a tilt that all views share.
+
+    It is zero where their tilts differ, or where one is known from the stage.
+    """
+    problem, result = adjustment.problem, adjustment.result
+    start = result.state.theta
+    column = columns_of(adjustment.functions)["rho"].start
+    rho = float(start[column])
+    none = np.zeros_like(result.covariance)
+    if problem.attitudes is not None or rho <= 0.0 or not are_tilted_alike(result.state.rotations):
+        return none
+    factor = max(variance_factor(problem, result), 1.0)
+    limit = 0.5 * factor * float(chi2.ppf(COMMON_TILT_CONFIDENCE, 3 * len(problem.group)))
+    least = float(np.sum(view_costs(problem, result.state)))
+    tolerance = PIVOT_TOLERANCE / result.cost
+
+    def presumed(theta: Array) -> float:
+        return float(0.5 * np.sum(((theta - problem.prior_mean) / problem.prior_sigma) ** 2))
+
+    def hold(value: float, theta: Array, near: State) -> tuple[State, bool]:
+        """Return the best state with this rho, from ``theta`` and poses near by, and whether the views allow it."""
+        held = _hold_pivot(problem, column, value, rho / value)
+        moved = refine(held, replace(near, theta=theta), fixed_theta=True).state
+        found = refine(
+            held, moved, max_iterations=PIVOT_ITERATIONS, tolerance=tolerance, predicted=tolerance
+        )
+        rise = float(np.sum(view_costs(held, found.state))) - least
+        return found.state, rise <= limit
+
+    thetas, values, costs = [start], [rho], [presumed(start)]
+    for ratio in (1.0 / PIVOT_RATIO, PIVOT_RATIO):
+        state, value, slope = result.state, rho, np.zeros_like(start)
+        for _ in range(PIVOT_STEPS_MAX):
+            last, value = (state.theta, value**-2.0), ratio * value
+            # What a tilt shortens goes with its square, and that with the inverse square of rho.
+            guess = last[0] + slope * (value**-2.0 - last[1])
+            guess[column] = value
+            state, allowed = hold(value, guess, state)
+            cost = presumed(state.theta)
+            if not allowed or cost > min(costs) + 0.5 * PIVOT_SIGMAS**2:
+                break
+            slope = (state.theta - last[0]) / (value**-2.0 - last[1])
+            thetas.append(state.theta)
+            values.append(value)
+            costs.append(cost)
+    # The values are equally far apart in the logarithm, and the prior is one of rho.
+    likely = np.log(values) - np.array(costs)
+    weight = np.exp(likely - likely.max())
+    apart = np.stack(thetas) - start
+    return np.asarray(np.einsum("k,ka,kb->ab", weight / weight.sum(), apart, apart))
