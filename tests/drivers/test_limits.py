@@ -30,9 +30,30 @@ LIMITS = MotionLimits(
 )
 
 
-def test_positions_within_the_soft_limits_are_taken_ends_included() -> None:
-    LIMITS.check_target({"tilt": 0.5, "x": -1e-3})
-    LIMITS.check_way({"tilt": 0.5, "x": -1e-3}, {"tilt": 0.3, "x": -9e-4}, {})
+@pytest.mark.parametrize(("tilt", "taken"), [(0.5, True), (-0.1, True), (0.5001, False)])
+def test_positions_within_the_soft_limits_are_taken_ends_included(tilt: float, taken: bool) -> None:
+    assert _is_taken({"tilt": tilt, "x": -1e-3}) == taken
+
+
+def _is_taken(target: dict[str, float]) -> bool:
+    try:
+        LIMITS.check_target(target)
+    except MicroscopeError:
+        return False
+    return True
+
+
+def _may_go(target: dict[str, float], position: dict[str, float]) -> bool:
+    try:
+        LIMITS.check_way(target, position, {})
+    except MicroscopeError:
+        return False
+    return True
+
+
+def test_steps_are_taken_up_to_their_limit() -> None:
+    assert _may_go({"tilt": 0.5, "x": -1e-3}, {"tilt": 0.3, "x": -9e-4})
+    assert not _may_go({"tilt": 0.5, "x": -1e-3}, {"tilt": 0.29, "x": -9e-4})
 
 
 @pytest.mark.parametrize(
@@ -75,7 +96,8 @@ def test_ways_that_are_refused(
 
 
 def test_a_stage_outside_of_its_limits_may_come_back_in_steps() -> None:
-    LIMITS.check_way({"tilt": 0.5}, {"tilt": 0.65}, {})
+    assert _may_go({"tilt": 0.5}, {"tilt": 0.65})
+    assert not _may_go({"tilt": 0.5}, {"tilt": 0.75})
 
 
 def test_magnifications() -> None:

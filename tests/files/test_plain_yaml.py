@@ -19,7 +19,7 @@ from __future__ import annotations
 import pytest
 
 from semcal_ros.core.errors import CalibrationFileError
-from semcal_ros.files.plain_yaml import check_plain_yaml
+from semcal_ros.files.plain_yaml import check_plain_yaml, load_plain_yaml
 
 
 @pytest.mark.parametrize(
@@ -39,4 +39,5 @@ def test_yaml_that_no_calibration_has_is_refused(text: str, reason: str) -> None
 
 
 def test_plain_yaml_passes() -> None:
-    check_plain_yaml("a: [1, {b: [2.5]}]\nc: '*not an alias'\n", "text")
+    text = "a: [1, {b: [2.5]}]\nc: '*not an alias'\n"
+    assert load_plain_yaml(text, "text") == {"a": [1, {"b": [2.5]}], "c": "*not an alias"}

@@ -140,5 +140,7 @@ def test_a_calibration_ends_with_its_node_even_if_that_is_killed(session: Sessio
     """Last: the node is gone then."""
     session.begin("calibrate")
     worker = _worker(session)
+    assert is_alive(worker)
     session.node.stop(signal.SIGKILL)
     session.peer.wait_for(lambda: not is_alive(worker), "the end of the calibration process")
+    assert not is_alive(worker)

@@ -188,6 +188,7 @@ def test_frames_that_came_seldom_do_not_let_it_move_unseen_for_longer(peer: Peer
         # 2.5 of the 0.5 s of a frame, and not of the 20 s between the two that came.
         peer.wait_for(lambda: microscope.speed == 0.0, "a stop", timeout_s=8.0)
         peer.wait_for(lambda: "no frames" in peer.state(SERVO).get("servo_state", ""), "the reason")
+        assert microscope.speed == 0.0
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 3600.0], ids=["own clock", "another clock"])
@@ -225,6 +226,7 @@ def test_a_simulated_clock_that_begins_after_the_frames_does_not_make_them_old(p
             return len(microscope.errors) > count + 10
 
         microscope.frames_until(measured, "measurements by the clock")
+        assert microscope.errors[-1].pose.pose.position.x == pytest.approx(6e-6, abs=20e-9)
 
 
 def test_a_start_without_a_stream_says_what_it_waits_for(peer: Peer) -> None:
@@ -248,6 +250,7 @@ def test_the_stamped_projection_of_a_frame_is_enough(peer: Peer) -> None:
         microscope.frames_until(lambda: _stands(microscope), "the stop without a camera")
         microscope.camera = replace(SCOPE.camera_at(G), rho=0.0)
         microscope.frames_until(lambda: _moves(microscope), "a command by a parallel camera")
+        assert microscope.errors[-1].pose.pose.position.x < 7e-6
 
 
 def test_the_stated_uncertainty_has_that_of_the_calibrations_scale(peer: Peer) -> None:
@@ -271,6 +274,7 @@ def test_the_stated_uncertainty_has_that_of_the_calibrations_scale(peer: Peer) -
         # Without it, as from bags of earlier versions, it is that of the image again.
         microscope.scale_sigma = None
         microscope.frames_until(lambda: stated_m() < 5e-9, "the uncertainty of the image alone")
+        assert microscope.errors[-1].pose.covariance[0] < (10e-9) ** 2
 
 
 def test_a_lost_target_a_missing_camera_and_a_turned_knob_stop_it(peer: Peer) -> None:

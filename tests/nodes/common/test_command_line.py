@@ -20,6 +20,7 @@ import re
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -52,9 +53,18 @@ def test_arguments_that_ros_would_ignore_are_refused(
         CommandLine(arguments).refuse_foreign()
 
 
-def test_arguments_for_ros_pass() -> None:
-    CommandLine(("--ros-args", "-p", "config:=x", "-r", "__ns:=/lab", "--")).refuse_foreign()
-    CommandLine().refuse_foreign()
+@pytest.mark.parametrize(
+    ("arguments", "passes"),
+    [
+        (("--ros-args", "-p", "config:=x", "-r", "__ns:=/lab", "--"), True),
+        ((), True),
+        (("--ros-args", "-p", "config:=x", "--", "__ns:=/lab"), False),
+    ],
+)
+def test_arguments_for_ros_pass(arguments: tuple[str, ...], passes: bool) -> None:
+    with nullcontext() if passes else pytest.raises(InvalidValueError) as refused:
+        CommandLine(arguments).refuse_foreign()
+    assert (refused is None) == passes
 
 
 def test_a_misspelt_parameter_is_refused_with_the_nearest_name() -> None:

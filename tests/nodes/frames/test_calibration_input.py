@@ -196,8 +196,10 @@ def test_a_calibration_that_may_be_of_a_recording_does_not_displace_another(
 def test_a_calibration_of_a_recording_fills_in_where_there_is_none() -> None:
     bench = Bench()
     bench.endpoints.subscriptions["calibration"].names = ["/sem/bag_player"]
+    assert bench.input.current is None
     bench.receive(0.10, sent_ns=1)
     bench.wait_for(0.10)
+    assert bench.width_m == 0.10
 
 
 def test_a_file_that_is_displaced_is_named_in_a_warning(file: str) -> None:
