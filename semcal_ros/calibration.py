@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from html import escape
 from typing import TYPE_CHECKING, cast, overload
@@ -104,7 +104,8 @@ class Calibration(CalibrationModel):
     def warnings(self) -> tuple[str, ...]:
         """What was suspicious when it was made, the costliest first; empty where a file does not say."""
         # The statistics in a file are notes, which may have been edited.
-        listed = self.statistics.get("warnings")
+        notes = self.statistics
+        listed = notes.get("warnings") if isinstance(notes, Mapping) else None
         if not isinstance(listed, (list, tuple)):
             return ()
         return tuple(text for text in listed if isinstance(text, str))

@@ -81,11 +81,16 @@ def test_its_table_holds_the_same(calibration):
     assert repr(edited) == "Calibration(<b>, 500x to 4000x, 512 x 512 px)"
 
 
-@pytest.mark.parametrize("noted", ["text", 3, None, {"a": "b"}, [1, None]])
+@pytest.mark.parametrize("noted", ["text", 3, None, {"a": "b"}, [], [1, None, ["nested"]]])
 def test_notes_that_are_no_list_of_texts_are_no_warnings(calibration, noted):
     edited = Calibration.from_model(replace(calibration, statistics={"warnings": noted}))
     assert edited.warnings == ()
     assert "warning" not in repr(edited) + edited._repr_html_()
+
+
+@pytest.mark.parametrize("statistics", [{}, None, ["warnings"]])
+def test_a_file_without_notes_has_no_warnings(calibration, statistics):
+    assert Calibration.from_model(replace(calibration, statistics=statistics)).warnings == ()
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array, iter])

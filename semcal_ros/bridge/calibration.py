@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,15 +112,9 @@ class ScaleWarnings:
         return " | ".join([*self.texts, *([f"and {more} more"] if more else [])])
 
 
-def read_scale_warnings(statistics: Mapping[str, Any]) -> ScaleWarnings:
-    """Return the warnings about nm per pixel among the statistics of a calibration.
-
-    The statistics of a file may be anything: what is no list of texts has no warnings.
-    """
-    listed = statistics.get("warnings") if isinstance(statistics, Mapping) else None
-    if not isinstance(listed, (list, tuple)):
-        return ScaleWarnings()
-    found = [w for w in listed if isinstance(w, str) and w.startswith(SCALE_PREFIX)]
+def pick_scale_warnings(warnings: Iterable[str]) -> ScaleWarnings:
+    """Return those of the warnings of a calibration that are about nm per pixel."""
+    found = [text for text in warnings if text.startswith(SCALE_PREFIX)]
     return ScaleWarnings(len(found), tuple(_clean(text) for text in found[:_MOST]))
 
 

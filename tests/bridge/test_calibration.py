@@ -16,51 +16,32 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import pytest
-
-from semcal_ros.bridge.calibration import ScaleWarnings, read_scale_warnings
+from semcal_ros.bridge.calibration import ScaleWarnings, pick_scale_warnings
 
 
 def test_only_the_warnings_about_the_scale_count() -> None:
-    found = read_scale_warnings(
-        {"warnings": ["scale: the grid is worn", "few views", "scale: the tilt is off"]}
-    )
+    found = pick_scale_warnings(["scale: the grid is worn", "few views", "scale: the tilt is off"])
     assert found == ScaleWarnings(2, ("the grid is worn", "the tilt is off"))
     assert found.summary == "scale of the calibration: 2 warnings, the first: the grid is worn"
     assert found.details == "the grid is worn | the tilt is off"
-    one = read_scale_warnings({"warnings": ["scale: the grid is worn"]})
+    one = pick_scale_warnings(["scale: the grid is worn"])
     assert one.summary == "scale of the calibration: a warning: the grid is worn"
 
 
-@pytest.mark.parametrize(
-    "statistics",
-    [
-        {},
-        {"warnings": None},
-        {"warnings": []},
-        {"warnings": "scale: no list"},
-        {"warnings": {"scale:": 1}},
-        {"warnings": [7, None, ["scale: nested"], "Scale: another word", " scale: later"]},
-        None,
-        ["warnings"],
-    ],
-)
-def test_a_file_without_them_has_none(statistics: Any) -> None:
-    found = read_scale_warnings(statistics)
+def test_others_do_not_count() -> None:
+    found = pick_scale_warnings(["Scale: another word", " scale: later", "few views"])
     assert (found.count, found.summary, found.details) == (0, "", "")
 
 
 def test_what_a_terminal_or_a_message_could_stumble_over_is_taken_out() -> None:
     text = "scale: one\x1b[31m\r\ntwo\x00 three\ud800\u202efour\t five"
-    found = read_scale_warnings({"warnings": [text, "scale:", "scale:\n\x07"]})
+    found = pick_scale_warnings([text, "scale:", "scale:\n\x07"])
     assert found.texts == ("one [31m two three four five", "without a text", "without a text")
     found.details.encode()
 
 
 def test_the_length_is_limited() -> None:
-    found = read_scale_warnings({"warnings": 3000 * ["scale: " + 10_000 * "ä"]})
+    found = pick_scale_warnings(3000 * ["scale: " + 10_000 * "ä"])
     assert found.count == 3000
     assert found.summary.startswith("scale of the calibration: 3000 warnings, the first: ää")
     assert found.summary.endswith("ä...")

@@ -29,7 +29,7 @@ from semcal_ros.bridge.calibration import (
     ScaleWarnings,
     calibration_text_from_message,
     fill_calibration_text,
-    read_scale_warnings,
+    pick_scale_warnings,
 )
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
@@ -110,7 +110,7 @@ def _parse(arrived: _Arrived) -> _Loaded | SemcalError:
 
 def report_scale_warnings(reporter: Reporter, calibration: Calibration) -> ScaleWarnings:
     """Log the warnings about nm per pixel, show them among the values of the node, and return them."""
-    warnings = read_scale_warnings(calibration.statistics)
+    warnings = pick_scale_warnings(calibration.warnings)
     if warnings.count:
         reporter.warn(warnings.summary)
         reporter.note("calibration_warnings", warnings.details)
