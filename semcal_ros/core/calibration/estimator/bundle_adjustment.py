@@ -230,13 +230,7 @@ def refine(
     :func:`~semcal_ros.core.calibration.estimator.trust_region.descend`. The function never
     raises for lack of convergence: the result says how it ended.
     """
-    effects = problem.effects
-    visits, views, lattices = 0, 0, 0
-    if effects is not None:
-        visits, views = len(effects.visit_group), len(problem.group)
-        lattices = 0 if effects.lattice_sigma is None else views
-    if (len(state.visits), len(state.drift_px), len(state.lattices)) != (visits, views, lattices):
-        state = empty_effects(problem, state)
+    state = _with_effects(problem, state)
     costs = view_costs(problem, state)
     if fixed_theta:
         state, costs, iterations, status = _refine_poses(
@@ -275,6 +269,30 @@ def refine(
         found.status,
         found.last_decrease,
     )
+
+
+def refine_poses(
+    problem: Problem, state: State, *, max_iterations: int, tolerance: float = COST_TOLERANCE
+) -> State:
+    """Return the state with the poses that minimise the robust reprojection error, and all else as it was.
+
+    This is :func:`refine` with ``fixed_theta``, without what is known after it.
+    """
+    state = _with_effects(problem, state)
+    costs = view_costs(problem, state)
+    return _refine_poses(problem, state, costs, max_iterations, tolerance)[0]
+
+
+def _with_effects(problem: Problem, state: State) -> State:
+    """Return the state, or one with zero effects where it is not of this problem."""
+    effects = problem.effects
+    visits, views, lattices = 0, 0, 0
+    if effects is not None:
+        visits, views = len(effects.visit_group), len(problem.group)
+        lattices = 0 if effects.lattice_sigma is None else views
+    if (len(state.visits), len(state.drift_px), len(state.lattices)) == (visits, views, lattices):
+        return state
+    return empty_effects(problem, state)
 
 
 def _follow_with_poses(problem: Problem, costs: Array, step: _Change) -> _Point:

@@ -38,12 +38,14 @@ from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     Adjustment,
     refine,
+    refine_poses,
     variance_factor,
 )
 from semcal_ros.core.calibration.estimator.residuals import view_costs
 from semcal_ros.core.calibration.estimator.thresholds import (
     ALIKE_FORESHORTENING,
     COMMON_TILT_CONFIDENCE,
+    FIT_STEPS_MAX,
     PIVOT_HELD_PART,
     PIVOT_ITERATIONS,
     PIVOT_RATIO,
@@ -107,7 +109,7 @@ def common_tilt_covariance(adjustment: Adjustment) -> Array:
     def hold(value: float, theta: Array, near: State) -> tuple[State, bool]:
         """Return the best state with this rho, from ``theta`` and poses near by, and whether the views allow it."""
         held = _hold_pivot(problem, column, value, rho / value)
-        moved = refine(held, replace(near, theta=theta), fixed_theta=True).state
+        moved = refine_poses(held, replace(near, theta=theta), max_iterations=FIT_STEPS_MAX)
         found = refine(
             held, moved, max_iterations=PIVOT_ITERATIONS, tolerance=tolerance, predicted=tolerance
         )

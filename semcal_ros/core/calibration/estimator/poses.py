@@ -32,7 +32,7 @@ from semcal_ros.core.calibration.estimator.blocks import Problem, State, pick_vi
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     BundleResult,
     refine,
-    weighted_squares,
+    refine_poses,
 )
 from semcal_ros.core.calibration.estimator.problem import (
     Functions,
@@ -40,7 +40,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     VarianceComponents,
     build_problem,
 )
-from semcal_ros.core.calibration.estimator.residuals import view_residuals
+from semcal_ros.core.calibration.estimator.residuals import view_squares
 from semcal_ros.core.calibration.estimator.thresholds import (
     COARSE_TOLERANCE,
     DECREASE_MIN,
@@ -234,10 +234,10 @@ def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
     # Turning about the middle of the visible points keeps the view in place.
     moved = np.einsum("vij,vj->vi", state.rotations - rotations, middle)
     mirrored = replace(state, rotations=rotations, translations_m=state.translations_m + moved)
-    own = refine(problem, state, fixed_theta=True, max_iterations=POSE_STEPS)
-    other = refine(problem, mirrored, fixed_theta=True, max_iterations=POSE_STEPS)
-    better = _view_costs(problem, other) < _view_costs(problem, own) - DECREASE_MIN
-    return pick_views(better, other.state, own.state), int(better.sum())
+    own = refine_poses(problem, state, max_iterations=POSE_STEPS)
+    other = refine_poses(problem, mirrored, max_iterations=POSE_STEPS)
+    better = view_squares(problem, other) < view_squares(problem, own) - DECREASE_MIN
+    return pick_views(better, other, own), int(better.sum())
 
 
 def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, int]:
@@ -248,9 +248,8 @@ def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, 
     """
     table = problem.cameras(state.theta)
     count = 0
-    own = refine(problem, state, fixed_theta=True, max_iterations=POSE_STEPS)
-    best = own.state
-    costs = _view_costs(problem, own)
+    best = refine_poses(problem, state, max_iterations=POSE_STEPS)
+    squares = view_squares(problem, best)
     starts = [
         _affine_poses(setup, view, table[k])
         for view, k in zip(setup.views, problem.group, strict=True)
@@ -267,10 +266,11 @@ def restart_poses(setup: Setup, problem: Problem, state: State) -> tuple[State, 
             drift_px=np.zeros_like(state.drift_px),
             lattices=np.zeros_like(state.lattices),
         )
-        other = refine(problem, fresh, fixed_theta=True, max_iterations=POSE_STEPS)
-        other_costs = _view_costs(problem, other)
-        better = other_costs < costs - DECREASE_MIN
-        best, costs = pick_views(better, other.state, best), np.where(better, other_costs, costs)
+        other = refine_poses(problem, fresh, max_iterations=POSE_STEPS)
+        other_squares = view_squares(problem, other)
+        better = other_squares < squares - DECREASE_MIN
+        best = pick_views(better, other, best)
+        squares = np.where(better, other_squares, squares)
         count += int(better.sum())
     return best, count
 
@@ -290,15 +290,6 @@ def _affine_poses(setup: Setup, view: GridView, parameters: Array) -> tuple[Arra
         return pose_from_camera(view, camera)
     except (InvalidValueError, CalibrationError, np.linalg.LinAlgError):
         return None
-
-
-def _view_costs(problem: Problem, result: BundleResult) -> Array:
-    square = weighted_squares(problem, result)
-    known = view_residuals(problem, result.state).values()
-    own = np.sum([np.sum(residual.values**2, axis=1) for residual in known], axis=0)
-    # A pose that moves corners to where the camera shows nothing is none.
-    square = np.where(result.lost, np.inf, square)
-    return np.bincount(problem.view_of_point, weights=square) + own
 
 
 def thin_view(view: GridView) -> GridView:

@@ -227,6 +227,18 @@ def view_costs(problem: Problem, state: State) -> Array:
     return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * np.sum(own, axis=0)
 
 
+def view_squares(problem: Problem, state: State) -> Array:
+    """Return (V,) sums of the squares of corners with Huber's weights, and of what is known of the views besides.
+
+    A view with a corner that has no projection has an infinite one: to move it there is no improvement.
+    """
+    norm = whitened_norm(problem, corner_residuals(problem, state))
+    weight = _huber(norm)[1]
+    square = np.where(weight > 0.0, norm**2 * weight, np.inf)
+    own = [np.sum(r.values**2, axis=1) for r in view_residuals(problem, state).values()]
+    return np.bincount(problem.view_of_point, weights=square) + np.sum(own, axis=0)
+
+
 def prior_cost(problem: Problem, state: State) -> float:
     """Return half the sum of squares of theta and of the visits about their priors."""
     prior = (state.theta - problem.prior_mean) / problem.prior_sigma
