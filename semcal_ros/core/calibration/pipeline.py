@@ -161,6 +161,12 @@ def calibrate_views(
     contradiction = _find_contradicted_stage(views, setup)
     if contradiction:
         bare = [replace(view, stage=None) for view in views]
+        if not are_enough(bare, options):
+            raise CalibrationError(
+                f"{counted(len(views), 'view')} that contradict the tilt of the stage",
+                expected=f"tilts that the images agree with, or at least {VIEWS_MIN} views, which need none",
+                do="check the unit of the stage's angles, its stamps and stage.tilt_axis_deg, or record more views",
+            )
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
         joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
     notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]

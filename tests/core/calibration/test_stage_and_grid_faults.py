@@ -30,6 +30,7 @@ from semcal_ros.core.calibration.judgement.findings import find_weaknesses
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis, StageReading
+from semcal_ros.core.errors import CalibrationError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
 
@@ -243,6 +244,32 @@ def test_an_axis_the_wrong_way_round_is_said():
     views = views_of(replace(ONE_AXIS, reading_sigma_rad=0.003), seed=10, readings=True)
     result = calibrated(views, axis=StageAxis(0.2 + np.pi))
     assert any("add 180 to stage.tilt_axis_deg" in note for note in scale_notes(result))
+
+
+def _two_views(factor, rotation_rad):
+    """Two views whose tilts are read as less than they are."""
+    views = stage_views(
+        MICROSCOPE.camera_at, (500.0,), replace(ONE_AXIS, tilts_rad=(0.45, 0.65)), readings=True
+    )
+    return [
+        replace(
+            v, stage=replace(v.stage, tilt_rad=factor * v.stage.tilt_rad, rotation_rad=rotation_rad)
+        )
+        for v in views
+    ]
+
+
+def test_two_views_that_contradict_the_stage_are_refused_for_that():
+    with pytest.raises(CalibrationError, match="2 views that contradict the tilt of the stage"):
+        calibrated(_two_views(0.8, 0.0), axis=StageAxis(0.2))
+
+
+def test_tilts_that_only_an_unusual_scan_explains_are_said():
+    """Nothing tells that two views lie otherwise than the stage says, but for what no microscope is like."""
+    notes = scale_notes(calibrated(_two_views(0.25, None), axis=StageAxis(0.2)))
+    assert any("the pixels have skew 0.0" in note and "check the tilts" in note for note in notes)
+    right = scale_notes(calibrated(_two_views(1.0, None), axis=StageAxis(0.2)))
+    assert not any("the pixels have" in note for note in right)
 
 
 @pytest.mark.long

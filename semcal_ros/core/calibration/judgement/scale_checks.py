@@ -30,6 +30,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     HYSTERESIS_FALSE_ALARMS,
     ONE_DIRECTION,
     SURPRISING_SIGMAS,
+    UNUSUAL_SIGMAS,
 )
 from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.solve import JointFit
@@ -155,6 +156,27 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
     return out
 
 
+def _find_unusual_scan(setup: Setup, model: CalibrationModel) -> list[Finding]:
+    """List by how much the pixels are less square than those of any usual microscope.
+
+    Wrong tilts of a few views pass for such pixels, and nothing else shows it.
+    """
+    out = []
+    for name, what, index in (("aspect", "aspect ratio", 1), ("skew", "skew", 2)):
+        mean, sigma = setup.prior_of(name)
+        values = [float(model.at(float(g)).parameters[index]) for g in setup.magnifications]
+        worst = max(values, key=lambda value: abs(value - mean))
+        if abs(worst - mean) > UNUSUAL_SIGMAS * sigma:
+            out.append(
+                Finding(
+                    f"scale: the pixels have {what} {worst:.3f}, where {mean:g} +- {sigma:g} is usual: check the "
+                    "tilts of the stage and the untilted views, and that the pictures were not stretched",
+                    cost_relative=abs(worst - mean),
+                )
+            )
+    return out
+
+
 def measure_excess(setup: Setup, fit: JointFit) -> tuple[float, float]:
     """RMS in px by which corners are off beyond their own noise, where that is most nm, and the magnification there."""
     problem, result = fit.adjustment.problem, fit.adjustment.result
@@ -198,6 +220,7 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
             )
         )
     out += _find_stage_errors(setup, fit, model)
+    out += _find_unusual_scan(setup, model)
     remedy = (
         "add views with the grating turned to other directions"
         if show_lines(setup.views)

@@ -252,6 +252,11 @@ SURPRISING_SIGMAS = TABLE.derived(
     "Of the prior of a constant of the stage or of the pivot, that says that the configuration is wrong: by chance "
     "one of 16 000 (normal, both sides).",
 )
+UNUSUAL_SIGMAS = TABLE.derived(
+    "UNUSUAL_SIGMAS", 2.58, "prior sigma",
+    "Of aspect ratio and skew, beyond which they are unusual: one microscope of a hundred each, if these were as "
+    "different as the wide priors allow.",
+)
 HYSTERESIS_FALSE_ALARMS = TABLE.defined(
     "HYSTERESIS_FALSE_ALARMS", 3e-4, "chance",
     "With which a calibration without one is said to have a hysteresis, once in 3000.",
