@@ -45,6 +45,7 @@ from semcal_ros.core.calibration.estimator.residuals import view_costs
 from semcal_ros.core.calibration.estimator.thresholds import (
     ALIKE_FORESHORTENING,
     COMMON_TILT_CONFIDENCE,
+    COMMON_TILT_SLACK,
     FIT_STEPS_MAX,
     PIVOT_HELD_PART,
     PIVOT_ITERATIONS,
@@ -99,36 +100,42 @@ def common_tilt_covariance(adjustment: Adjustment) -> Array:
     if problem.attitudes is not None or rho <= 0.0 or not are_tilted_alike(result.state.rotations):
         return none
     factor = max(variance_factor(problem, result), 1.0)
-    limit = 0.5 * factor * float(chi2.ppf(COMMON_TILT_CONFIDENCE, 3 * len(problem.group)))
+    chance = 0.5 * factor * float(chi2.ppf(COMMON_TILT_CONFIDENCE, 3 * len(problem.group)))
+    limit = COMMON_TILT_SLACK * chance
     least = float(np.sum(view_costs(problem, result.state)))
     tolerance = PIVOT_TOLERANCE / result.cost
 
     def presumed(theta: Array) -> float:
         return float(0.5 * np.sum(((theta - problem.prior_mean) / problem.prior_sigma) ** 2))
 
-    def hold(value: float, theta: Array, near: State) -> tuple[State, bool]:
-        """Return the best state with this rho, from ``theta`` and poses near by, and whether the views allow it."""
+    def hold(value: float, theta: Array, near: State) -> tuple[State, float]:
+        """Return the best state with this rho, from ``theta`` and poses near by, and what the views cost more."""
         held = _hold_pivot(problem, column, value, rho / value)
         moved = refine_poses(held, replace(near, theta=theta), max_iterations=FIT_STEPS_MAX)
         found = refine(
             held, moved, max_iterations=PIVOT_ITERATIONS, tolerance=tolerance, predicted=tolerance
         )
-        rise = float(np.sum(view_costs(held, found.state))) - least
-        return found.state, rise <= limit
+        return found.state, float(np.sum(view_costs(held, found.state))) - least
 
     thetas, values, costs = [start], [rho], [presumed(start)]
     for ratio in (1.0 / PIVOT_RATIO, PIVOT_RATIO):
         state, value, slope = result.state, rho, np.zeros_like(start)
+        unlikely = 0
         for _ in range(PIVOT_STEPS_MAX):
             last, value = (state.theta, value**-2.0), ratio * value
             # What a tilt shortens goes with its square, and that with the inverse square of rho.
             guess = last[0] + slope * (value**-2.0 - last[1])
             guess[column] = value
-            state, allowed = hold(value, guess, state)
+            state, rise = hold(value, guess, state)
             cost = presumed(state.theta)
-            if not allowed or cost > min(costs) + 0.5 * PIVOT_SIGMAS**2:
+            # One that is not at its optimum yet may look unlikely.
+            unlikely = unlikely + 1 if cost > min(costs) + 0.5 * PIVOT_SIGMAS**2 else 0
+            if rise > 2.0 * limit or unlikely > 1:
                 break
             slope = (state.theta - last[0]) / (value**-2.0 - last[1])
+            if rise > limit:
+                # Others beyond may be allowed.
+                continue
             thetas.append(state.theta)
             values.append(value)
             costs.append(cost)

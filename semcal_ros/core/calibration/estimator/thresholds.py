@@ -309,6 +309,11 @@ COMMON_TILT_CONFIDENCE = TABLE.derived(
     "That views of one tilt cost no more under it than under any other: two angles and a height of each then follow "
     "from few numbers, each of which could save half a chi-square.",
 )
+COMMON_TILT_SLACK = TABLE.stated(
+    "COMMON_TILT_SLACK", 2.0, "times",
+    "As much, up to which views allow a tilt: the coefficients were chosen for the camera that was found, and follow "
+    "another one less well.",
+)
 PIVOT_HELD_PART = TABLE.cost(
     "PIVOT_HELD_PART", 0.02, "of rho",
     "To which it is held.",
