@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -32,23 +33,19 @@ LIMITS = MotionLimits(
 
 @pytest.mark.parametrize(("tilt", "taken"), [(0.5, True), (-0.1, True), (0.5001, False)])
 def test_positions_within_the_soft_limits_are_taken_ends_included(tilt: float, taken: bool) -> None:
-    assert _is_taken({"tilt": tilt, "x": -1e-3}) == taken
+    assert _passes(LIMITS.check_target, {"tilt": tilt, "x": -1e-3}) == taken
 
 
-def _is_taken(target: dict[str, float]) -> bool:
+def _passes(check: Callable[..., None], *arguments: Mapping[str, float]) -> bool:
     try:
-        LIMITS.check_target(target)
+        check(*arguments)
     except MicroscopeError:
         return False
     return True
 
 
-def _may_go(target: dict[str, float], position: dict[str, float]) -> bool:
-    try:
-        LIMITS.check_way(target, position, {})
-    except MicroscopeError:
-        return False
-    return True
+def _may_go(target: Mapping[str, float], position: Mapping[str, float]) -> bool:
+    return _passes(LIMITS.check_way, target, position, {})
 
 
 def test_steps_are_taken_up_to_their_limit() -> None:

@@ -62,7 +62,7 @@ from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_mode
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.paper.methods import fit_separately
 from semcal_ros.core.calibration.select import select
-from semcal_ros.core.calibration.solve import JointFit, solve
+from semcal_ros.core.calibration.solve import JointFit, add_common_tilt, solve
 from semcal_ros.core.calibration.stage import (
     OFFSET_NAMES,
     StageAxis,
@@ -170,6 +170,7 @@ def calibrate_views(
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
         joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
     notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
+    joint = add_common_tilt(joint)
     fit = describe_fit(setup, joint)
     if options.untilted == "auto":
         notes += _propose_untilted(setup, joint, fit)

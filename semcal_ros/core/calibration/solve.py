@@ -214,10 +214,6 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     covariance = pad_covariance(setup, padded, field)
     if selection.pattern is not None:
         covariance = covariance + pattern_covariance(setup, padded, selection.pattern)
-    common = pad_chosen(padded, common_tilt_covariance(adjustment))
-    parts = split_covariance(padded)
-    parts = replace(parts, visits=parts.visits + common)
-    covariance[: len(common), : len(common)] += common
     return JointFit(
         adjustment,
         padded,
@@ -225,5 +221,17 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         field,
         selection.pattern,
         selection.excess_px,
-        parts,
+        split_covariance(padded),
     )
+
+
+def add_common_tilt(fit: JointFit) -> JointFit:
+    """Return the fit with the uncertainty of a tilt that all views share.
+
+    It takes as long as some adjustments, so that only the last fit of a calibration gets it.
+    """
+    common = pad_chosen(fit.padded, common_tilt_covariance(fit.adjustment))
+    covariance = fit.covariance.copy()
+    covariance[: len(common), : len(common)] += common
+    parts = replace(fit.parts, visits=fit.parts.visits + common)
+    return replace(fit, covariance=covariance, parts=parts)

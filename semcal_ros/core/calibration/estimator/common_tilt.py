@@ -21,27 +21,27 @@ views have one tilt, about one axis of the image, nothing tells a tilt of 17 deg
 between the tilts of two views costs least. Its covariance is that of the tangent, which knows the scale to 0.4 %.
 
 So rho is held at values to either side, and the rest adjusted to each. Each that the views allow counts by what is
-known beforehand of the camera alone (the priors of rho, aspect ratio and skew): what the views prefer among them is how
+known beforehand of the camera alone, the priors of its unknowns: what the views prefer among them is how
 little their tilts and heights differ, which is no chance where a holder made them equal. The second moment about the
 adjustment is added to its covariance. The estimate stays.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.blocks import Problem, State
+from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     Adjustment,
     refine,
     refine_poses,
     variance_factor,
 )
-from semcal_ros.core.calibration.estimator.residuals import view_costs
+from semcal_ros.core.calibration.estimator.residuals import theta_cost, view_costs
 from semcal_ros.core.calibration.estimator.thresholds import (
     ALIKE_FORESHORTENING,
     COMMON_TILT_CONFIDENCE,
@@ -53,6 +53,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     PIVOT_SIGMAS,
     PIVOT_STEPS_MAX,
     PIVOT_TOLERANCE,
+    RISE_GIVEN_UP,
 )
 from semcal_ros.core.camera.calibration_model import columns_of
 
@@ -87,60 +88,70 @@ def _hold_pivot(problem: Problem, column: int, value: float, ratio: float) -> Pr
     return replace(held, effects=replace(effects, height_sigma_m=ratio * effects.height_sigma_m))
 
 
-def common_tilt_covariance(adjustment: Adjustment) -> Array:
-    """Return the (K, K) covariance of theta that is added for a tilt that all views share.
+@dataclass(frozen=True)
+class _Camera:
+    """A camera that the views allow: its rho, the unknowns with it, and what these cost by their priors."""
 
-    It is zero where their tilts differ, or where one is known from the stage.
-    """
+    rho: float
+    theta: Array
+    cost: float
+
+
+def _walk(adjustment: Adjustment, column: int) -> list[_Camera]:
+    """Return the cameras along the curve, with that of the adjustment; ``column`` is that of rho."""
     problem, result = adjustment.problem, adjustment.result
     start = result.state.theta
-    column = columns_of(adjustment.functions)["rho"].start
     rho = float(start[column])
-    none = np.zeros_like(result.covariance)
-    if problem.attitudes is not None or rho <= 0.0 or not are_tilted_alike(result.state.rotations):
-        return none
     factor = max(variance_factor(problem, result), 1.0)
     chance = 0.5 * factor * float(chi2.ppf(COMMON_TILT_CONFIDENCE, 3 * len(problem.group)))
     limit = COMMON_TILT_SLACK * chance
     least = float(np.sum(view_costs(problem, result.state)))
     tolerance = PIVOT_TOLERANCE / result.cost
-
-    def presumed(theta: Array) -> float:
-        return float(0.5 * np.sum(((theta - problem.prior_mean) / problem.prior_sigma) ** 2))
-
-    def hold(value: float, theta: Array, near: State) -> tuple[State, float]:
-        """Return the best state with this rho, from ``theta`` and poses near by, and what the views cost more."""
-        held = _hold_pivot(problem, column, value, rho / value)
-        moved = refine_poses(held, replace(near, theta=theta), max_iterations=FIT_STEPS_MAX)
-        found = refine(
-            held, moved, max_iterations=PIVOT_ITERATIONS, tolerance=tolerance, predicted=tolerance
-        )
-        return found.state, float(np.sum(view_costs(held, found.state))) - least
-
-    thetas, values, costs = [start], [rho], [presumed(start)]
+    allowed = [_Camera(rho, start, theta_cost(problem, start))]
     for ratio in (1.0 / PIVOT_RATIO, PIVOT_RATIO):
         state, value, slope = result.state, rho, np.zeros_like(start)
         unlikely = 0
         for _ in range(PIVOT_STEPS_MAX):
             last, value = (state.theta, value**-2.0), ratio * value
             # What a tilt shortens goes with its square, and that with the inverse square of rho.
-            guess = last[0] + slope * (value**-2.0 - last[1])
-            guess[column] = value
-            state, rise = hold(value, guess, state)
-            cost = presumed(state.theta)
+            theta = last[0] + slope * (value**-2.0 - last[1])
+            theta[column] = value
+            held = _hold_pivot(problem, column, value, rho / value)
+            near = replace(state, theta=theta)
+            state = refine(
+                held,
+                refine_poses(held, near, max_iterations=FIT_STEPS_MAX),
+                max_iterations=PIVOT_ITERATIONS,
+                tolerance=tolerance,
+                predicted=tolerance,
+            ).state
+            rise = float(np.sum(view_costs(held, state))) - least
+            cost = theta_cost(problem, state.theta)
             # One that is not at its optimum yet may look unlikely.
-            unlikely = unlikely + 1 if cost > min(costs) + 0.5 * PIVOT_SIGMAS**2 else 0
-            if rise > 2.0 * limit or unlikely > 1:
+            least_cost = min(camera.cost for camera in allowed)
+            unlikely = unlikely + 1 if cost > least_cost + 0.5 * PIVOT_SIGMAS**2 else 0
+            if rise > RISE_GIVEN_UP * limit or unlikely > 1:
                 break
             slope = (state.theta - last[0]) / (value**-2.0 - last[1])
-            if rise > limit:
-                # Others beyond may be allowed.
-                continue
-            thetas.append(state.theta)
-            values.append(value)
-            costs.append(cost)
-    # The values are equally far apart in the logarithm, and the prior is one of rho.
-    likely = np.log(values) - np.array(costs)
+            # Beyond one that the views do not allow, others may be allowed.
+            if rise <= limit:
+                allowed.append(_Camera(value, state.theta, cost))
+    return allowed
+
+
+def common_tilt_covariance(adjustment: Adjustment) -> Array:
+    """Return the (K, K) covariance of theta that is added for a tilt that all views share.
+
+    It is zero where their tilts differ, or where one is known from the stage.
+    """
+    problem, state = adjustment.problem, adjustment.result.state
+    column = columns_of(adjustment.functions)["rho"].start
+    known = problem.attitudes is not None or not are_tilted_alike(state.rotations)
+    if known or state.theta[column] <= 0.0:
+        return np.zeros_like(adjustment.result.covariance)
+    cameras = _walk(adjustment, column)
+    # The values of rho are equally far apart in the logarithm, and the prior is one of rho.
+    likely = np.array([np.log(camera.rho) - camera.cost for camera in cameras])
     weight = np.exp(likely - likely.max())
-    apart = np.stack(thetas) - start
+    apart = np.stack([camera.theta for camera in cameras]) - state.theta
     return np.asarray(np.einsum("k,ka,kb->ab", weight / weight.sum(), apart, apart))

@@ -223,8 +223,7 @@ def _huber(norm: Array) -> tuple[Array, Array]:
 def view_costs(problem: Problem, state: State) -> Array:
     """Return (V,) half robust sums of squares of corners, and of what is known of the views besides."""
     loss, _ = _huber(whitened_norm(problem, corner_residuals(problem, state)))
-    own = [np.sum(r.values**2, axis=1) for r in view_residuals(problem, state).values()]
-    return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * np.sum(own, axis=0)
+    return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * _known_squares(problem, state)
 
 
 def view_squares(problem: Problem, state: State) -> Array:
@@ -235,17 +234,27 @@ def view_squares(problem: Problem, state: State) -> Array:
     norm = whitened_norm(problem, corner_residuals(problem, state))
     weight = _huber(norm)[1]
     square = np.where(weight > 0.0, norm**2 * weight, np.inf)
+    return np.bincount(problem.view_of_point, weights=square) + _known_squares(problem, state)
+
+
+def _known_squares(problem: Problem, state: State) -> Array:
+    """(V,) sums of squares of what is known of the views beside their corners."""
     own = [np.sum(r.values**2, axis=1) for r in view_residuals(problem, state).values()]
-    return np.bincount(problem.view_of_point, weights=square) + np.sum(own, axis=0)
+    return np.asarray(np.sum(own, axis=0))
+
+
+def theta_cost(problem: Problem, theta: Array) -> float:
+    """Return half the sum of squares of theta about its priors."""
+    prior = (theta - problem.prior_mean) / problem.prior_sigma
+    return 0.5 * float(prior @ prior)
 
 
 def prior_cost(problem: Problem, state: State) -> float:
     """Return half the sum of squares of theta and of the visits about their priors."""
-    prior = (state.theta - problem.prior_mean) / problem.prior_sigma
-    cost = float(prior @ prior)
+    cost = theta_cost(problem, state.theta)
     if problem.effects is not None:
-        cost += float(np.sum((state.visits / problem.effects.visit_sigmas) ** 2))
-    return 0.5 * cost
+        cost += 0.5 * float(np.sum((state.visits / problem.effects.visit_sigmas) ** 2))
+    return cost
 
 
 @dataclass(frozen=True)

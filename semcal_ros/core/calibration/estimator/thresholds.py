@@ -314,6 +314,10 @@ COMMON_TILT_SLACK = TABLE.stated(
     "As much, up to which views allow a tilt: the coefficients were chosen for the camera that was found, and follow "
     "another one less well.",
 )
+RISE_GIVEN_UP = TABLE.cost(
+    "RISE_GIVEN_UP", 2.0, "times",
+    "What views allow, beyond which the walk ends.",
+)
 PIVOT_HELD_PART = TABLE.cost(
     "PIVOT_HELD_PART", 0.02, "of rho",
     "To which it is held.",
