@@ -42,6 +42,7 @@ from semcal_ros.core.drift.thresholds import (
     OVERLAY_FIRST_FRAMES,
     STRIPE_MOVE_PX_MAX,
 )
+from semcal_ros.core.registration.agreement import MovingTiles
 
 
 @dataclass(frozen=True)
@@ -164,13 +165,20 @@ class StaticParts:
         """Whether it is time to try a frame without what may be stripes."""
         return self.frames <= OVERLAY_FIRST_FRAMES or self.frames % OVERLAY_EVERY_FRAMES == 0
 
-    def suspect_stripes(self, image: AnyImage, least: float) -> StaticParts:
+    def suspect_stripes(
+        self, image: AnyImage, moving: MovingTiles | None, least: float
+    ) -> StaticParts:
         """The same, with stripes in all directions in which a frame, as it came, may have them: of ``least`` of its
-        cells.
+        cells, where nothing is ``moving``.
         """
-        mask = self._mask(image)
-        whole = image if mask is None else remove_overlay(image, mask)
-        return replace(self, stripes=self.stripes | suspect_stripes(to_levels(whole), least))
+        hidden = self._mask(image)
+        if moving is not None:
+            height, width = image.shape[:2]
+            tool = moving.grown().draw((width, height)) > 0
+            hidden = tool if hidden is None else hidden | tool
+        return replace(
+            self, stripes=self.stripes | suspect_stripes(to_levels(image), hidden, least)
+        )
 
     def look_for_fixed(
         self, image: AnyImage, drift_px: Array, px_from_unit: Array

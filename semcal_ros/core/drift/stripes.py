@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array, Image
+from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
 from semcal_ros.core.drift.fixed_parts import look_beside
 from semcal_ros.core.drift.thresholds import (
     STRIPE_CELLS_MIN,
@@ -109,34 +109,40 @@ def find_stripes(before: Image, now: Image, shift_px: Array) -> Stripes:
     return Stripes(_has_stripes(left, own), _has_stripes(left.T, own.T))
 
 
-def suspect_stripes(image: Image, least: float = STRIPE_CELLS_MIN) -> Stripes:
+def suspect_stripes(
+    image: Image, hidden: Mask | None = None, least: float = STRIPE_CELLS_MIN
+) -> Stripes:
     """In which directions an image (h, w) has lines with brightness in common: stripes, or a specimen of such lines.
 
-    ``least`` is the part of the cells that agree.
+    What is ``hidden`` (h, w) by something else does not count, as a tool, whose edges would be in many lines. ``least``
+    is the part of the cells that agree.
     """
-    found = (_measure_common(each, least) is not None for each in (image, image.T))
-    return Stripes(*found)
+    seen = np.ones(image.shape, np.float32) if hidden is None else np.asarray(~hidden, np.float32)
+    pairs = (image, seen), (image.T, seen.T)
+    return Stripes(*(_measure_common(*pair, least) is not None for pair in pairs))
 
 
 def _has_stripes(left: Image, image: Image) -> bool:
     """Whether the lines of what a shift has ``left`` of an image share brightness that is no structure of it."""
-    common = _measure_common(left, STRIPE_CELLS_MIN)
+    seen = np.ones(image.shape, np.float32)
+    common = _measure_common(left, seen, STRIPE_CELLS_MIN)
     if common is None:
         return False
     # A specimen of lines leaves some of them where the shift is a little off, and nothing else tells its place.
-    whole = _profile(image).mean(axis=0)
+    whole = _profile(image, seen)[0].mean(axis=0)
     gradient = np.diff(image, axis=0)
     share = image.shape[1] * float(np.sum(np.diff(whole) ** 2)) / float(np.sum(gradient**2))
     return share < STRIPE_SHARE_MAX or float(np.sum(common**2)) > 0.5 * float(np.sum(whole**2))
 
 
-def _measure_common(image: Image, least: float) -> Array | None:
-    """(lines,) brightness that the lines of an image have in common over its width; None where it is that of chance.
+def _measure_common(image: Image, seen: Image, least: float) -> Array | None:
+    """(lines,) brightness that the lines of an image have in common over its width, of what is ``seen`` (1, else 0);
+    None where it is that of chance, or less than half is seen.
 
     Each strip is compared with the mean of the others in parts of its length. Stripes are everywhere: nearly all of
     these cells agree in sign, where noise does in half of them, and a tool or the edge of a shadow are in some.
     """
-    profiles = _profile(image)
+    profiles, is_seen = _profile(image, seen)
     strips, count = profiles.shape
     if count < STRIPE_PROFILE_MIN:
         return None
@@ -144,14 +150,34 @@ def _measure_common(image: Image, least: float) -> Array | None:
     others = (strips * common - profiles) / (strips - 1)
     starts = np.linspace(0, count, STRIPE_PARTS, endpoint=False).astype(int)
     cells = np.add.reduceat(profiles * others, starts, axis=1)
-    return common if np.mean(cells > 0.0) >= least else None
+    tells = np.logical_or.reduceat(is_seen, starts, axis=1)
+    if 2 * np.count_nonzero(tells) < tells.size:
+        return None
+    return common if np.mean(cells[tells] > 0.0) >= least else None
 
 
-def _profile(image: Image) -> Array:
-    """(strips, lines) means of the lines of an image in strips beside each other, without what changes slowly."""
-    strips = np.array_split(np.asarray(image, dtype=np.float32), STRIPE_STRIPS, axis=1)
-    profiles = np.array([strip.mean(axis=1) for strip in strips])
-    window = max(3, int(STRIPE_SHADING * profiles.shape[1]) | 1)
-    profiles = profiles - cv2.blur(profiles, (window, 1), borderType=cv2.BORDER_REFLECT)
-    limit = STRIPE_CLIP * 1.4826 * np.median(np.abs(profiles), axis=1, keepdims=True)
-    return np.clip(profiles, -limit, limit).astype(np.float64)
+def _profile(image: Image, seen: Image) -> tuple[Array, Mask]:
+    """(strips, lines) means of the lines of an image in strips beside each other, of what is ``seen`` (1, else 0) and
+    without what changes slowly; and where half of the line is seen. Elsewhere they are 0.
+    """
+    share = _average_strips(seen)
+    # The mean of a small part is that of another place.
+    is_seen = share >= 0.5
+    means = _average_strips(np.asarray(image, dtype=np.float32) * seen) / np.maximum(share, 0.5)
+    width = max(3, int(STRIPE_SHADING * means.shape[1]) | 1)
+    slow, count = (
+        cv2.blur(np.asarray(each, np.float32), (width, 1), borderType=cv2.BORDER_REFLECT)
+        for each in (means * is_seen, is_seen)
+    )
+    profiles = (means - slow / np.maximum(count, 0.5 / width)) * is_seen
+    for profile, has in zip(profiles, is_seen, strict=True):
+        if np.any(has):
+            limit = STRIPE_CLIP * 1.4826 * float(np.median(np.abs(profile[has])))
+            np.clip(profile, -limit, limit, out=profile)
+    return profiles.astype(np.float64), is_seen
+
+
+def _average_strips(image: Image) -> Image:
+    """(strips, lines) means of the lines of an image in strips beside each other."""
+    strips = np.array_split(image, STRIPE_STRIPS, axis=1)
+    return np.array([strip.mean(axis=1) for strip in strips])

@@ -266,7 +266,9 @@ def _follow_without_stripes(
         looks = rejection.status in STRIPE_FAILURES and state.rejected < STRIPE_TRIES
     # What was measured says by itself whether stripes make a difference.
     least = STRIPE_CELLS_MIN if rejection is not None else STRIPE_CELLS_TRIED
-    static = state.static.suspect_stripes(raw, least) if looks else state.static
+    static = state.static
+    if looks:
+        static = static.suspect_stripes(raw, with_them.moving, least)
     if static.stripes == state.static.stripes:
         return found
     cleaned, frame = _without(setup, state, static, replace(found[2], image=raw))

@@ -52,10 +52,8 @@ def find_periods(image: Image, noise_variance: float) -> Array:
     top, left = (image.shape[0] - rows) // 2, (image.shape[1] - cols) // 2
     part = remove_shading(np.asarray(image[top : top + rows, left : left + cols]))
     part, left = _soften(part - part.mean())
-    size = (
-        scipy.fft.next_fast_len(2 * rows, real=True),
-        scipy.fft.next_fast_len(2 * cols, real=True),
-    )
+    # Lags of up to half of it do not meet those from the other end.
+    size = tuple(scipy.fft.next_fast_len(n + n // 2, real=True) for n in (rows, cols))
     spectrum = scipy.fft.rfft2(part, size)
     whole = scipy.fft.irfft2(np.abs(spectrum) ** 2, size)
     high, wide = rows // 2, cols // 2
