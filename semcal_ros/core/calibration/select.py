@@ -127,7 +127,7 @@ def candidate_names(
     return tuple(name for name in ALL_FUNCTIONS if name in functions or name in terms)
 
 
-class _Candidates:
+class Candidates:
     """Cross-validation scores of candidate function sets.
 
     The equations of all coefficients that any candidate may have are made once; a candidate is a
@@ -142,15 +142,13 @@ class _Candidates:
         terms: Sequence[str],
     ):
         self.names = candidate_names(base, terms)
-        self.setup = setup
-        self.scores: dict[tuple[tuple[str, int], ...], float] = {}
-        self.priors: dict[tuple[str, str, int], tuple[Array, Array]] = {}
         # Columns of each function in the order of its coefficients, and those of its jumps.
         self.columns: dict[tuple[str, str], Indices] = {}
         self.jumps: dict[str, Indices] = {}
         magnifications = [float(g) for g in setup.magnifications]
         blocks: list[Array] = []
         rows: list[int] = []
+        means, sigmas = [], []
         for row, name in enumerate(self.names):
             most = _most_of(name)
             most = max(most, base[name].smooth_size if name in base else 0)
@@ -159,13 +157,17 @@ class _Candidates:
                 self.columns[name, kind] = np.arange(len(rows), len(rows) + most)
                 blocks.append(np.stack([blank.basis(g) for g in magnifications]))
                 rows += [row] * most
+                mean, sigma = setup.coefficient_priors(name, kind, most)
+                means.append(mean[:most])
+                sigmas.append(sigma[:most])
             breaks = setup.breaks_of(name)
             self.jumps[name] = np.arange(len(rows), len(rows) + len(breaks))
             blocks.append((np.array(magnifications)[:, None] >= breaks).astype(np.float64))
             rows += [row] * len(breaks)
+            means.append(mean[most:])
+            sigmas.append(sigma[most:])
         shared = len(summary.shared_mean)
         self.shared = np.arange(len(rows), len(rows) + shared)
-        self.shared_prior = summary.shared_mean, summary.shared_precision
         values = np.concatenate(blocks, axis=1)
         # The scale is the first of the functions.
         nominal = setup.nominal_px_per_m(setup.magnifications)
@@ -176,43 +178,107 @@ class _Candidates:
         transposed = np.swapaxes(designs, 1, 2)
         self.matrices = transposed @ summary.information @ designs
         self.rights = (transposed @ summary.right[:, :, None])[:, :, 0]
+        prior_mean = np.concatenate([*means, summary.shared_mean])
+        precision = np.concatenate([np.concatenate(sigmas) ** -2.0, summary.shared_precision])
+        # The inner magnifications are predicted from the others, the two outermost ones from all.
+        inner = np.ones((len(magnifications), 1, 1))
+        inner[[0, -1]] = 0.0
+        self.others = self.matrices.sum(axis=0) + np.diag(precision) - inner * self.matrices
+        self.other_rights = (
+            self.rights.sum(axis=0) + precision * prior_mean - inner[:, 0] * self.rights
+        )
 
-    def _prior(self, name: str, kind: str, size: int) -> tuple[Array, Array]:
-        if size == 0:
-            return np.zeros(0), np.zeros(0)
-        key = (name, kind, size)
-        if key not in self.priors:
-            mean, sigma = self.setup.coefficient_priors(name, kind, size)
-            self.priors[key] = mean, sigma**-2.0
-        return self.priors[key]
-
-    def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
-        """Return the cost of predicting inner magnifications and of fitting the outermost ones."""
-        key = tuple(sizes[name] for name in self.names)
-        if key not in self.scores:
-            self.scores[key] = self._score(sizes)
-        return self.scores[key]
-
-    def _score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
-        chosen: list[Indices] = []
+    def _columns_of(self, sizes: Mapping[str, tuple[str, int]]) -> Indices:
+        chosen = []
         for name in self.names:
             kind, size = sizes[name]
             chosen += [self.columns[name, kind][:size], self.jumps[name]]
-        columns = np.concatenate([*chosen, self.shared])
-        priors = [self._prior(name, *sizes[name]) for name in self.names]
-        mean, precision = (
-            np.concatenate(parts) for parts in zip(*priors, self.shared_prior, strict=True)
+        return np.concatenate([*chosen, self.shared])
+
+    def score(self, sizes: Mapping[str, tuple[str, int]]) -> float:
+        """Return the cost of predicting inner magnifications and of fitting the outermost ones."""
+        columns = self._columns_of(sizes)
+        solution = solve_scaled(
+            _blocks(self.others, columns, columns), self.other_rights[:, columns]
         )
-        matrices = self.matrices[:, columns[:, None], columns]
-        rights = self.rights[:, columns]
-        matrix = matrices.sum(axis=0) + np.diag(precision)
-        right = rights.sum(axis=0) + precision * mean
-        # The inner magnifications are predicted from the others, the two outermost ones from all.
-        inner = np.ones((len(matrices), 1, 1))
-        inner[[0, -1]] = 0.0
-        solution = solve_scaled(matrix - inner * matrices, right - inner[:, 0] * rights)
-        bent = (matrices @ solution[:, :, None])[:, :, 0]
-        return float(np.sum((0.5 * bent - rights) * solution))
+        bent = _times(_blocks(self.matrices, columns, columns), solution)
+        return float(np.sum((0.5 * bent - self.rights[:, columns]) * solution))
+
+    def changes(
+        self,
+        sizes: Mapping[str, tuple[str, int]],
+        options: Mapping[str, Sequence[tuple[str, int]]],
+    ) -> dict[tuple[str, tuple[str, int]], float]:
+        """Return by how much the score falls where a function gets one of its options, for all functions and options.
+
+        All options of a function are blocks that are added to the same rest, whose equations are solved once.
+        """
+        columns = self._columns_of(sizes)
+        # Functions that are not there share one rest.
+        named: dict[bytes, tuple[Indices, list[str]]] = {}
+        for name in options:
+            kind, size = sizes[name]
+            rest = columns[~np.isin(columns, self.columns[name, kind][:size])]
+            named.setdefault(rest.tobytes(), (rest, []))[1].append(name)
+        falls: dict[tuple[str, tuple[str, int]], float] = {}
+        for rest, names in named.values():
+            blocks: dict[tuple[str, str], list[int]] = {}
+            for name in names:
+                for kind, size in (sizes[name], *options[name]):
+                    blocks.setdefault((name, kind), []).append(size)
+            scores = self._scores_beside(rest, blocks)
+            for name in names:
+                now = scores[name, sizes[name]]
+                falls |= {(name, option): now - scores[name, option] for option in options[name]}
+        return falls
+
+    def _scores_beside(
+        self, rest: Indices, blocks: Mapping[tuple[str, str], Sequence[int]]
+    ) -> dict[tuple[str, tuple[str, int]], float]:
+        """Return the scores of the columns ``rest`` and the first so many columns of a function of a kind, beyond the
+        score of the rest alone; ``blocks`` tells how many, of each.
+
+        With the block inverse, the rest moves by ``-pulled`` times the coefficients that are added.
+        """
+        added = np.concatenate([self.columns[key][: max(counts)] for key, counts in blocks.items()])
+        coupling = _blocks(self.others, rest, added)
+        solved = solve_scaled(
+            _blocks(self.others, rest, rest),
+            np.concatenate([coupling, self.other_rights[:, rest, None]], axis=2),
+        )
+        pulled, solution = solved[:, :, :-1], solved[:, :, -1]
+        right = self.other_rights[:, added] - _times(np.swapaxes(coupling, 1, 2), solution)
+        # Slope and curvature of the cost of the magnification that was left out.
+        of_rest = _blocks(self.matrices, rest, rest)
+        mixed = np.swapaxes(_blocks(self.matrices, rest, added), 1, 2)
+        slope = _times(mixed, solution) - self.rights[:, added]
+        slope -= _times(np.swapaxes(pulled, 1, 2), _times(of_rest, solution) - self.rights[:, rest])
+        bent = of_rest @ pulled
+        scores, first = {}, 0
+        for (name, kind), counts in blocks.items():
+            own = slice(first, first + max(counts))
+            transposed = np.swapaxes(pulled[:, :, own], 1, 2)
+            left = _blocks(self.others, added[own], added[own]) - transposed @ coupling[:, :, own]
+            both = mixed[:, own] @ pulled[:, :, own]
+            curvature = transposed @ bent[:, :, own] - both - np.swapaxes(both, 1, 2)
+            curvature += _blocks(self.matrices, added[own], added[own])
+            for n in counts:
+                few = slice(first, first + n)
+                change = solve_scaled(left[:, :n, :n], right[:, few])
+                cost = 0.5 * _times(curvature[:, :n, :n], change) + slope[:, few]
+                scores[name, (kind, n)] = float(np.sum(cost * change))
+            first = own.stop
+        return scores
+
+
+def _blocks(matrices: Array, rows: Indices, columns: Indices) -> Array:
+    """(M, r, c) some rows and columns of matrices (M, K, K)."""
+    return np.asarray(matrices[:, rows[:, None], columns])
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    """(M, p) products of matrices (M, p, q) and vectors (M, q)."""
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
 def select_functions(
@@ -230,7 +296,7 @@ def select_functions(
     costs less. One of ``terms`` may have none, and needs more of a gain for the first. The ``current``
     choice stays unless another one is clearly better.
     """
-    candidates = _Candidates(summary, setup, functions, (*free, *terms))
+    candidates = Candidates(summary, setup, functions, (*free, *terms))
     # Each magnification is predicted from the others. Two are only fitted, by a straight line.
     known = len(setup.magnifications)
     most = known if known == 2 else known - 1
@@ -240,25 +306,48 @@ def select_functions(
     sizes.update(dict.fromkeys(free, ("chebyshev_log", 1)))
     sizes.update(dict.fromkeys(terms, ("chebyshev_log", 0)))
     while True:
-        score = candidates.score(sizes)
-        best: tuple[float, str, tuple[str, int]] | None = None
-        for name, option in _moves(sizes, limits, terms):
-            trial = candidates.score({**sizes, name: option})
-            gain = score - trial - _price(option[1]) + _price(sizes[name][1])
-            if name in free:
-                gain = score - trial - _cost(option) + _cost(sizes[name])
-            if gain > 1e-6 and (best is None or gain > best[0]):
-                best = (gain, name, option)
-        if best is None:
+        falls = candidates.changes(sizes, _moves(sizes, limits, terms))
+        better = _find_better(candidates, sizes, falls, free)
+        if better is None:
             break
-        sizes[best[1]] = best[2]
+        sizes = better
     if current is not None:
         kept = {**sizes, **current}
         more = sum(kept[name][1] - sizes[name][1] for name in free) * COEFFICIENT_GAIN
         more += sum(_price(kept[name][1]) - _price(sizes[name][1]) for name in terms)
-        if candidates.score(kept) + more < score + CHOICE_GAIN:
+        if candidates.score(kept) + more < candidates.score(sizes) + CHOICE_GAIN:
             sizes = kept
     return {name: sizes[name] for name in (*free, *terms)}
+
+
+def _find_better(
+    candidates: Candidates,
+    sizes: Mapping[str, tuple[str, int]],
+    falls: Mapping[tuple[str, tuple[str, int]], float],
+    free: Sequence[str],
+) -> dict[str, tuple[str, int]] | None:
+    """Return the sizes after the change that gains most; None where none gains.
+
+    What a change gains is known to a part of what its function explains. The score itself decides.
+    """
+
+    def price(name: str, option: tuple[str, int]) -> float:
+        return _cost(option) if name in free else _price(option[1])
+
+    gains = {
+        (name, option): fall - price(name, option) + price(name, sizes[name])
+        for (name, option), fall in falls.items()
+    }
+    # Below, it may be rounding.
+    score, least = candidates.score(sizes), 1e-6
+    for (name, option), gain in sorted(gains.items(), key=lambda item: -item[1]):
+        if gain <= least:
+            return None
+        changed = {**sizes, name: option}
+        dearer = price(name, option) - price(name, sizes[name])
+        if score - candidates.score(changed) - dearer > least:
+            return changed
+    return None
 
 
 def _most_of(name: str) -> int:
@@ -279,16 +368,14 @@ def _price(size: int) -> float:
 
 def _moves(
     sizes: Mapping[str, tuple[str, int]], limits: Mapping[str, int], terms: Sequence[str]
-) -> list[tuple[str, tuple[str, int]]]:
-    moves = []
+) -> dict[str, list[tuple[str, int]]]:
+    """Return to what each function may be changed in one step."""
+    moves = {}
     for name, limit in limits.items():
-        kind, size = sizes[name]
         least = 0 if name in terms else 1
-        for other in _POLYNOMIALS[:1] if name in SCAN_NAMES else _POLYNOMIALS:
-            for change in (-1, 0, 1, 2):
-                option = (other, size + change)
-                if least <= option[1] <= limit and option != (kind, size):
-                    moves.append((name, option))
+        kinds = _POLYNOMIALS[:1] if name in SCAN_NAMES else _POLYNOMIALS
+        options = [(kind, sizes[name][1] + more) for kind in kinds for more in (-1, 0, 1, 2)]
+        moves[name] = [o for o in options if least <= o[1] <= limit and o != sizes[name]]
     return moves
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup, constant_functions
-from semcal_ros.core.calibration.select import Summary, select_functions
+from semcal_ros.core.calibration.select import Candidates, Summary, select_functions
 
 MAGNIFICATIONS = np.geomspace(100.0, 10000.0, 6)
 
@@ -48,3 +48,37 @@ def test_the_outermost_magnifications_are_never_left_out(outermost: int) -> None
     values = np.ones(6)
     values[outermost] += 0.003
     assert _aspect_size(values, 1e6) > 1
+
+
+def test_changes_from_one_solution_are_those_of_solving_every_candidate() -> None:
+    """Random equations of ten functions and two shared unknowns; some functions are there, others not."""
+    rng = np.random.default_rng(3)
+    setup = Setup((), MAGNIFICATIONS, (512, 512), 0.12, Priors())
+    terms = ("xi_s", "coil_x2")
+    base = constant_functions(setup, {})
+    count = len(base) + len(terms) + 2
+    roots = rng.normal(size=(6, count, 3 * count))
+    summary = Summary(
+        roots @ np.swapaxes(roots, 1, 2),
+        rng.normal(size=(6, count)),
+        np.zeros(2),
+        np.array([4.0, 9.0]),
+    )
+    candidates = Candidates(summary, setup, base, terms)
+    sizes = dict.fromkeys(base, ("chebyshev_log", 1))
+    sizes |= {"xi_s": ("chebyshev_log", 0), "coil_x2": ("chebyshev_log", 1)}
+    sizes |= {"aspect": ("chebyshev", 3), "xi_r": ("chebyshev_log", 2)}
+    options = {
+        "aspect": [("chebyshev", 2), ("chebyshev", 5), ("chebyshev_log", 3)],
+        "xi_r": [("chebyshev_log", 1), ("chebyshev", 2)],
+        "xi_s": [("chebyshev_log", 1), ("chebyshev", 2)],
+        "coil_x2": [("chebyshev_log", 0), ("chebyshev_log", 2)],
+    }
+    falls = candidates.changes(sizes, options)
+    assert set(falls) == {(name, option) for name in options for option in options[name]}
+    score = candidates.score(sizes)
+    for (name, option), fall in falls.items():
+        # What differs is rounding.
+        expected = score - candidates.score({**sizes, name: option})
+        assert fall == pytest.approx(expected, rel=1e-7, abs=1e-7)
+        assert expected != 0.0
