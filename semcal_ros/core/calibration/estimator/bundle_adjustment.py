@@ -317,16 +317,18 @@ def _follow_with_poses(problem: Problem, costs: Array, step: _Change) -> _Point:
 def _refine_poses(
     problem: Problem, state: State, costs: Array, max_iterations: int, tolerance: float
 ) -> tuple[State, Array, int, DescentStatus]:
-    """Adjust the unknowns of each view on its own by Levenberg-Marquardt, for all views at once.
+    """Adjust the unknowns of each view on its own by Levenberg-Marquardt, for all views at once that have not ended.
 
     Returns the state, the costs of the views, the number of iterations, and why they ended.
     """
+    whole, whole_costs, part = state, costs.copy(), problem
+    moves = np.ones(len(costs), dtype=bool)
     damping = np.full(len(costs), FIRST_DAMPING)
     own, diagonal = problem.layout.view, np.arange(problem.layout.of_view.size)
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        normal = normal_equations(problem, state, poses_only=True, for_step=True)
+        normal = normal_equations(part, state, poses_only=True, for_step=True)
         pose = normal.matrix[:, own, own].copy()
         pose[:, diagonal, diagonal] = damped_diagonal(pose, damping[:, None])
         try:
@@ -335,18 +337,23 @@ def _refine_poses(
             damping = 10.0 * damping
             continue
         still = np.zeros_like(state.visits)
-        trial = retract(problem, state, np.zeros_like(state.theta), change, still)
-        trial_costs = view_costs(problem, trial)
+        trial = retract(part, state, np.zeros_like(state.theta), change, still)
+        trial_costs = view_costs(part, trial)
         better = trial_costs <= costs
         decrease = np.where(better, costs - trial_costs, 0.0)
         state = pick_views(better, trial, state)
         costs = np.where(better, trial_costs, costs)
         damping = np.where(better, np.maximum(0.1 * damping, DAMPING_MIN), 10.0 * damping)
         predicted = 0.5 * np.einsum("vp,vp->v", normal.right[:, own], change)
-        small = tolerance * (1.0 + costs)
-        if np.all(np.where(better, decrease, predicted) <= small):
-            return state, costs, iterations, DescentStatus.SMALL_DECREASE
-    return state, costs, iterations, DescentStatus.ITERATION_LIMIT
+        goes_on = np.where(better, decrease, predicted) > tolerance * (1.0 + costs)
+        whole, whole_costs[moves] = with_states_of(whole, moves, state), costs
+        if not np.any(goes_on):
+            return whole, whole_costs, iterations, DescentStatus.SMALL_DECREASE
+        if not np.all(goes_on):
+            moves[moves] = goes_on
+            part, state = select_views(problem, moves), states_of(whole, moves)
+            costs, damping = costs[goes_on], damping[goes_on]
+    return whole, whole_costs, iterations, DescentStatus.ITERATION_LIMIT
 
 
 def _make_result(
