@@ -100,6 +100,24 @@ def scale_notes(result):
     return [w for w in result.warnings if w.startswith("scale:")]
 
 
+@pytest.mark.parametrize("untilted", ["all", "none", "first"])
+def test_views_that_are_named_untilted_and_tilted_by_the_stage_are_said(untilted):
+    views = stage_views(
+        MICROSCOPE.camera_at, (500.0, 2000.0), ONE_AXIS, readings=True, most_corners=40
+    )
+    tilts = {v.name: abs(v.stage.tilt_rad) for v in views}
+    # The first view is flat by the stage, too: nothing contradicts it.
+    flat = min(tilts, key=tilts.get)
+    assert tilts[flat] < 0.01 < 0.6 < max(tilts.values())
+    result = calibrated(views, untilted=(flat,) if untilted == "first" else untilted)
+    said = [w for w in result.warnings if "named untilted" in w]
+    assert bool(said) == (untilted == "all")
+    if said:
+        tilted = [t for t in tilts.values() if t > 0.1]
+        assert said[0].startswith(f"scale: {len(tilted)} views are named untilted")
+        assert f"by {np.degrees(max(tilts.values())):.1f} degrees" in said[0]
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_wavy_grid_is_the_grids_and_no_residual_field():

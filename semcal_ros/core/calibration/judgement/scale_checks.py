@@ -36,6 +36,7 @@ from semcal_ros.core.calibration.method_fit import Finding
 from semcal_ros.core.calibration.solve import JointFit
 from semcal_ros.core.calibration.views import show_lines
 from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.wording import counted
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,7 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
     out: list[Finding] = []
     if not any(v.has_stage_tilt for v in setup.views):
         return out
+    out += _find_tilted_untilted(setup)
     errors = (
         ("stage_tilt", "tilt", setup.priors.stage_tilt_sigma),
         ("stage_axis", "direction of the tilt axis", setup.priors.stage_axis_sigma),
@@ -154,6 +156,27 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
             )
         )
     return out
+
+
+def _find_tilted_untilted(setup: Setup) -> list[Finding]:
+    """Say which views are named untilted and are tilted as the stage says, by more than its zero may be off."""
+    sigma = float(np.hypot(setup.priors.untilted_sigma_rad, setup.priors.stage_tilt_sigma))
+    tilts = {
+        v.name: v.stage.tilt_rad
+        for v in setup.views
+        if v.untilted and v.stage is not None and v.stage.tilt_rad is not None
+    }
+    tilted = {name: t for name, t in tilts.items() if abs(t) > SURPRISING_SIGMAS * sigma}
+    if not tilted:
+        return []
+    most = max(tilted, key=lambda name: abs(tilted[name]))
+    return [
+        Finding(
+            f"scale: {counted(len(tilted), 'view is', 'views are')} named untilted (--untilted), but tilted as the "
+            f"stage says, by {np.degrees(tilted[most]):.1f} degrees in {most}: the stage is believed. Leave out "
+            "--untilted, or mend the readings of the stage"
+        )
+    ]
 
 
 def _find_unusual_scan(setup: Setup, model: CalibrationModel) -> list[Finding]:
