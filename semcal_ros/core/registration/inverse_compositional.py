@@ -350,6 +350,13 @@ class _Comparison:
         left = tiles.image - 2.0 * tiles.gain * tiles.common + tiles.gain**2 * tiles.reference
         return _expect_variances(self, left / counts)
 
+    @cached_property
+    def variances_at_gradients(self) -> Array:
+        """(tiles, 2, 2) the same, as the residuals where the gradients are tell it."""
+        gain = (self.geometry.ramps @ self.fit.gain).reshape(self.plain.energy.shape)
+        squares = residuals_at_gradients(self.level, self.window, self.plain, gain)
+        return _expect_variances(self, squares)
+
     def weighs_alike(self, window: TileWindow, weights: Array | None) -> bool:
         """Whether the tiles of a window are those of this comparison, with the same weights."""
         return (
@@ -703,9 +710,7 @@ def _expect_spread(comparison: _Comparison, powers: Array) -> Array:
     A tile has some hundred pixels, and only two scores: of a few tiles it is the better estimate. It does not see what
     moves a tile as a whole.
     """
-    gain = (comparison.geometry.ramps @ comparison.fit.gain).reshape(comparison.plain.energy.shape)
-    squares = residuals_at_gradients(comparison.level, comparison.window, comparison.plain, gain)
-    variances = _expect_variances(comparison, squares)
+    variances = comparison.variances_at_gradients
     both = np.einsum("tp,tq,tij->piqj", powers, powers, variances)
     return np.asarray(both.reshape(2 * powers.shape[1], -1))
 

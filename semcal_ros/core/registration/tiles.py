@@ -110,6 +110,14 @@ class PyramidLevel:
         return np.asarray(np.maximum(self.normal_matrices[..., 3, 3], 1.0))
 
     @cached_property
+    def squared_gradients(self) -> Image:
+        """(rows, cols, n) squares of the gradient at each tile's pixels, also at those that do not count."""
+        if self.undropped is not None:
+            return self.undropped.squared_gradients
+        slopes = self.products[:, :, :2]
+        return np.asarray(np.einsum("rckn,rckn->rcn", slopes, slopes))
+
+    @cached_property
     def noise_products(self) -> Array:
         """(rows, cols, 2, 2) each tile's part in the covariance of the sum over tiles of the products of gradients with
         white noise of which, after the smoothing, variance one is left.
@@ -403,14 +411,14 @@ def residuals_at_gradients(
 
     Of a bright particle on a dark ground, noise is where the gradients are: the mean of all pixels is some times less.
     """
-    slopes, grey = np.split(level.products[window.rows, window.cols], [2], axis=2)
+    grey = level.products[window.rows, window.cols, 2]
     counts = level.pixel_counts[window.rows, window.cols]
     sum_of_reference = level.normal_matrices[window.rows, window.cols, 2, 3]
     offset = (sums.cross[..., 3] - gain * sum_of_reference) / counts
-    left = sums.pixels - gain[..., None] * grey[:, :, 0] - offset[..., None]
-    energies = np.einsum("rckn,rckn->rcn", slopes, slopes)
+    left = sums.pixels - gain[..., None] * grey - offset[..., None]
+    energies = level.squared_gradients[window.rows, window.cols]
     if level.dropped is not None:
-        energies[level.dropped[window.rows, window.cols]] = 0.0
+        energies = np.where(level.dropped[window.rows, window.cols], np.float32(0.0), energies)
     weighted = np.einsum("rcn,rcn,rcn->rc", energies, left, left)
     return np.asarray(weighted / np.maximum(energies.sum(axis=2, dtype=np.float64), 1e-30))
 
