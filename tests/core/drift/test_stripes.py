@@ -23,6 +23,7 @@ import pytest
 
 from semcal_ros.core.drift.estimates import DriftUpdate
 from semcal_ros.core.drift.stripes import Stripes, find_stripes, suspect_stripes
+from semcal_ros.core.drift.thresholds import STRIPE_CELLS_TRIED
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.drift_scenes import Texture, noisy
 
@@ -103,6 +104,21 @@ def test_few_images_of_noise_look_like_stripes() -> None:
         for stripes in (suspect_stripes(pair[0]), find_stripes(*pair, np.array([2.3, -1.6]))):
             found += stripes.lines + stripes.columns
     assert found == 0
+
+
+def test_a_tool_that_is_known_is_not_suspected_to_be_stripes() -> None:
+    """A bright tool with a slanted edge over a third of an image of noise, and then with stripes in all of it."""
+    rng = np.random.default_rng(2)
+    at_y, at_x = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    tool = at_y < SIZE / 3.0 + 0.05 * at_x
+    image = rng.normal(size=(SIZE, SIZE)) + 60.0 * tool
+    striped = image + np.sin(2.0 * np.pi * at_y / 23.0)
+    least = STRIPE_CELLS_TRIED
+    assert suspect_stripes(image.astype(np.float32), None, least).lines
+    assert suspect_stripes(image.astype(np.float32), tool, least) == Stripes()
+    assert suspect_stripes(striped.astype(np.float32), tool, least) == Stripes(lines=True)
+    # Of what is left beside a tool over most of the image, little says what its lines have in common.
+    assert suspect_stripes(striped.astype(np.float32), at_y < 0.8 * SIZE, least) == Stripes()
 
 
 def test_lines_without_stripes_have_one_median() -> None:
