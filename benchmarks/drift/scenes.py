@@ -347,8 +347,8 @@ class Kind:
         Counted per pixel of brightness one.
     step_px
         Drift from frame to frame.
-    jump_px
-        A move of the stage in the middle.
+    jump_px, jump_line
+        A move of the stage in the middle, and from which part of the lines of that frame on it shows.
     determined
         Whether the drift can be known at all.
     """
@@ -358,6 +358,7 @@ class Kind:
     electrons: float = 60.0
     step_px: float = 0.5
     jump_px: float = 0.0
+    jump_line: float = 0.0
     determined: bool = True
 
 
@@ -366,6 +367,8 @@ KINDS: dict[str, Kind] = {
     "gold at 2 electrons": Kind(gold, electrons=8.0),
     "charging gold": Kind(gold, charging),
     "gold and a stage move": Kind(gold, jump_px=60.0),
+    "gold and a move within a frame": Kind(gold, jump_px=60.0, jump_line=0.3),
+    "ridges and a move within a frame": Kind(ridges, jump_px=20.0, jump_line=0.4),
     "fast gold": Kind(gold, step_px=3.0),
     "sparse": Kind(sparse),
     "fine": Kind(fine),
@@ -424,13 +427,22 @@ def draw(
     wobble = np.cumsum(rng.normal(0, 0.12 * kind.step_px, (FRAMES, 2)), axis=0)
     drift = np.cumsum(steps + wobble, axis=0)
     drift -= drift[0]
-    drift[FRAMES // 2 :] += kind.jump_px * np.array([0.8, -0.6])
+    jump = kind.jump_px * np.array([0.8, -0.6])
+    drift[FRAMES // 2 :] += jump
     foreground_seed = int(rng.integers(1 << 30))
     margin = (TORUS - SIZE) // 2
     frames, bounds = [], []
-    for k, (dx, dy) in enumerate(drift[:count]):
-        moved = np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (fx * dx + fy * dy)), (TORUS, TORUS))
-        view = moved[margin : margin + SIZE, margin : margin + SIZE]
+
+    def show(at_px: Floats) -> Floats:
+        turned = np.exp(-2j * np.pi * (fx * at_px[0] + fy * at_px[1]))
+        moved = np.fft.irfft2(spectrum * turned, (TORUS, TORUS))
+        return moved[margin : margin + SIZE, margin : margin + SIZE]
+
+    for k, at_px in enumerate(drift[:count]):
+        view = show(at_px)
+        if kind.jump_line and k == FRAMES // 2:
+            first = slice(0, int(kind.jump_line * SIZE))
+            view[first] = show(at_px - jump)[first]
         clean = kind.foreground(
             Frame(view, np.ones_like(view)), k, np.random.default_rng(foreground_seed)
         )

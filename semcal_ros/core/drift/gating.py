@@ -59,6 +59,12 @@ class OutlierTest:
         """The test after a frame that came as expected, with that state."""
         return cls((state.time_s, state.position))
 
+    def see(self, time_s: float, position: Array) -> OutlierTest:
+        """The test after a frame that was seen at an unexpected ``position`` (2,)."""
+        # The same frame may be compared with several keyframes.
+        earlier = tuple(e for e in self.unexpected if e[0] < time_s)
+        return replace(self, unexpected=(*earlier, (time_s, position))[-2:])
+
     def explain(
         self, state: DriftState, position: Array, reach: Array, last_s: float
     ) -> tuple[OutlierTest, Inflate | None]:
@@ -80,9 +86,8 @@ class OutlierTest:
         -------
         The test from then on, and the inflation; None where the position is an outlier.
         """
-        # The same frame may be compared with several keyframes.
         earlier = tuple(e for e in self.unexpected if e[0] < state.time_s)
-        test = replace(self, unexpected=(*earlier, (state.time_s, position))[-2:])
+        test = self.see(state.time_s, position)
 
         def is_near(expected: Array) -> bool:
             return bool(np.linalg.norm(np.linalg.solve(reach, position - expected)) <= 1.0)

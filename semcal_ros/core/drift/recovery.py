@@ -61,6 +61,12 @@ def coast(
         body=state.body.update(None),
         rejected=state.rejected + is_of_keyframe,
     )
+    suggested = np.asarray(np.linalg.solve(frame.px_from_unit, registration.suggested_px))
+    key, is_move = state.keyframes.current, rejection.status is MatchFailure.STAGE_MOVE
+    if key is not None and is_move and np.all(np.isfinite(suggested)):
+        # The last lines of the frame are a first look at where the stage went.
+        position = suggested + drift.keyframe_state(key)[:2]
+        state = replace(state, outliers=state.outliers.see(drift.time_s, position))
     since_s = max(drift.time_s - last_s, INTERVAL_S_MIN)
     is_lost = state.rejected >= setup.settings.lost_after
     if is_lost:

@@ -128,8 +128,8 @@ class Registration:
         (2,) the direction of lines along which the shift is the predicted one, since they do not tell it, and its
         covariance means nothing; None where both directions are measured.
     suggested_px
-        (2,) the shift with which most of a rejected image agrees, where it may be that of something else; NaN
-        otherwise.
+        (2,) another shift than the predicted one with which much of a rejected image agrees, where it may be that of
+        something else; NaN otherwise.
     """
 
     alignment: Alignment
@@ -611,13 +611,13 @@ def _register(
     if whole is not None:
         share = whole.share
     if kept is not None:
-        alignment, peak, moving, share = kept
+        alignment, peak, moving, share = kept.alignment, kept.peak, kept.moving, kept.share
+    suggested_px = np.full(2, np.nan) if kept is None else kept.other_px + origin
     if moving is not None:
         moving = replace(moving, corner_px=moving.corner_px + np.array(inside[:2]))
     if isinstance(alignment, Rejection):
         named = _name_deformation(alignment, reference, pyramid)
-        suggested = np.array(peak.shift_px) + origin if kept is not None else np.full(2, np.nan)
-        return Registration(unmeasured_alignment(), float("nan"), named, suggested_px=suggested)
+        return Registration(unmeasured_alignment(), float("nan"), named, suggested_px=suggested_px)
     signals = _measure_signals(reference, image_noise, alignment)
     correlation = signals.correlation
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
@@ -635,12 +635,15 @@ def _register(
     )
     height, width = np.shape(image)[:2]
     middle = 0.5 * (np.array([width, height]) - np.add(inside[:2], inside[2:]))
-    is_apart = rejection is not None and rejection.status is MatchFailure.STAGES_DISAGREE
+    if rejection is None:
+        suggested_px = np.full(2, np.nan)
+    elif rejection.status is MatchFailure.STAGES_DISAGREE:
+        suggested_px = moved.shift_px
     return Registration(
         moved,
         correlation,
         rejection,
-        suggested_px=moved.shift_px if is_apart else np.full(2, np.nan),
+        suggested_px=suggested_px,
         moving=moving,
         share=share,
         contrast=signals.contrast,

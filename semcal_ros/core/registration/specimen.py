@@ -22,6 +22,7 @@ nothing says which it is, the image is refused.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -80,6 +81,29 @@ def look_at_whole(
     return find_agreement(statistics, TileNoise.of(sigma_px, reference.noise_variance, image_noise))
 
 
+@dataclass(frozen=True)
+class Kept:
+    """The specimen alone, of an image in which something else moves.
+
+    Attributes
+    ----------
+    alignment
+        That of the specimen, or why it is not known.
+    peak
+        Where it was looked for.
+    moving, share
+        What moves otherwise, and the part of the structure that agrees.
+    other_px
+        (2,) another shift with which a part of the image agrees, which may be the one; NaN where there is none.
+    """
+
+    alignment: Alignment | Rejection[MatchFailure]
+    peak: CoarsePeak
+    moving: MovingTiles | None
+    share: float
+    other_px: Array
+
+
 def keep_specimen(
     reference: Reference,
     pyramid: Pyramid,
@@ -90,9 +114,8 @@ def keep_specimen(
     spread: Array | None,
     follow_px: Region | None = None,
     suspected: MovingTiles | None = None,
-) -> tuple[Alignment | Rejection[MatchFailure], CoarsePeak, MovingTiles | None, float] | None:
-    """The alignment of the specimen alone where not all of the image moves with it; None where all does. Where it is
-    ambiguous, the peak is at the shift with which most agrees.
+) -> Kept | None:
+    """The alignment of the specimen alone where not all of the image moves with it; None where all does.
 
     What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part; ``suspected`` is
     where something moved otherwise in the image before.
@@ -142,8 +165,11 @@ def keep_specimen(
                 # Another one may be that of the part that is the specimen.
                 continue
             is_near = spread is not None and _is_near(tried, guess, spread)
-            if is_near and sigma < WELL_PREDICTED_PX and agreement.share > MAJORITY_SHARE:
-                # No other one can have as much.
+            is_most = (
+                agreement.share > MAJORITY_SHARE and judge.share_of_new < 1.0 - SPECIMEN_SHARE_MIN
+            )
+            if is_near and sigma < WELL_PREDICTED_PX and is_most:
+                # No other one can have as much, and no tool comes in so fast.
                 break
     if not found:
         return None
@@ -151,16 +177,20 @@ def keep_specimen(
     if follow_px is not None:
         best = _choose_followed(found, reference, follow_px)
     else:
-        best = _choose_hypothesis(found, guess, spread)
+        best = _choose_hypothesis(reference, found, guess, spread)
+    others = [h for h in found if h is not best]
+    if isinstance(best, Rejection) and best.status is MatchFailure.STAGE_MOVE:
+        others = [h for h in found if spread is None or not _is_near(h.alignment, guess, spread)]
+    other_px = np.full(2, np.nan)
+    if others:
+        other_px = max(others, key=lambda h: h.agreement.share).alignment.shift_px
     if isinstance(best, Rejection):
-        most = max(found, key=lambda h: h.agreement.share)
-        x, y = most.alignment.shift_px.tolist()
-        return best, replace(most.start, shift_px=(x, y)), None, 0.0
+        return Kept(best, peak, None, 0.0, other_px)
     moving = find_moving(reference, best.alignment, best.agreement)
     share = best.agreement.share
     if follow_px is not None:
         share = _share_inside(best.alignment, best.agreement, reference, follow_px)
-    return best.alignment, best.start, moving, share
+    return Kept(best.alignment, best.start, moving, share, other_px)
 
 
 class _Judge:
@@ -176,6 +206,7 @@ class _Judge:
         level, self._noise = reference.levels[-1], noise
         self.latest: Agreement | None = None
         self._suspected: Mask | None = None
+        self._there: Mask | None = None
         if suspected is not None:
             rows, cols = level.normal_matrices.shape[:2]
             x, y = (
@@ -190,14 +221,26 @@ class _Judge:
         """Weights (rows, cols) to begin with, without what is suspected and what lies around it."""
         if self._suspected is None:
             return weights
-        around = cv2.dilate(self._suspected.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        return np.where(around, 0.0, weights)
+        return np.where(_with_neighbours(self._suspected), 0.0, weights)
 
     def __call__(self, tiles: TileStatistics) -> Array:
         """Weights of the compared tiles."""
-        there = None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
-        self.latest = find_agreement(tiles, self._noise, there)
+        self._there = None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
+        self.latest = find_agreement(tiles, self._noise, self._there)
         return self.latest.weights
+
+    @property
+    def share_of_new(self) -> float:
+        """Part of the structure that disagrees and did not do so in the image before."""
+        assert self.latest is not None
+        new, informs = self.latest.disagrees, self.latest.informs
+        if self._there is not None:
+            new = new & ~_with_neighbours(self._there)
+        return float(informs[new].sum() / max(informs.sum(), 1e-30))
+
+
+def _with_neighbours(tiles: Mask) -> Mask:
+    return np.asarray(cv2.dilate(tiles.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _choose_followed(
@@ -246,15 +289,18 @@ def _share_inside(
 
 
 def _choose_hypothesis(
-    found: list[_Hypothesis], guess: Array, spread: Array | None
+    reference: Reference, found: list[_Hypothesis], guess: Array, spread: Array | None
 ) -> _Hypothesis | Rejection[MatchFailure]:
-    """The shift that is the specimen's: by the prediction, or because nearly all agrees with it."""
+    """The shift that is the specimen's: by the prediction, or because nearly all agrees with it.
+
+    A stage that moves within a frame leaves its first lines where they were predicted, and the rest at another shift.
+    """
     ordered = sorted(found, key=lambda h: -h.agreement.share)
     if spread is not None:
         near = [h for h in ordered if _is_near(h.alignment, guess, spread)]
         sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
         if len(near) == 1 and sigma < PREDICTED_PX_MAX:
-            return near[0]
+            return _find_move(reference, near[0], ordered) or near[0]
     best = ordered[0]
     others = sum(h.agreement.share for h in ordered[1:])
     if best.agreement.share > SPECIMEN_SHARE_MIN and others < 0.5 * best.agreement.share:
@@ -264,6 +310,78 @@ def _choose_hypothesis(
         f"ambiguous: {100.0 * best.agreement.share:.0f} % of the structure moves by one shift, and "
         "nothing says that this is the specimen",
     )
+
+
+def _find_move(
+    reference: Reference, first: _Hypothesis, found: Sequence[_Hypothesis]
+) -> Rejection[MatchFailure] | None:
+    """Why an image is no picture of one place: its lines up to one of them agree with one shift, and those from there
+    on with another one. None where that is not so.
+
+    A tool that moves over the specimen is not found at another place of the reference, or not over whole lines.
+    """
+    own = _sum_lines(reference, first)
+    for other in found:
+        if other is first:
+            continue
+        others = _sum_lines(reference, other)
+        line, least, most = max(
+            (
+                _compare_sides(*pair, line)
+                for line in own.y[1:].tolist()
+                for pair in ((own, others), (others, own))
+            ),
+            key=lambda sides: sides[1] - sides[2],
+        )
+        if least > SPECIMEN_SHARE_MIN > most:
+            moved_px = float(np.hypot(*(other.alignment.shift_px - first.alignment.shift_px)))
+            return Rejection(
+                MatchFailure.STAGE_MOVE,
+                f"the stage moved within the frame: from line {line:.0f} on, the specimen is {moved_px:.1f} px away "
+                "from where the lines before show it",
+            )
+    return None
+
+
+def _compare_sides(before: _Lines, after: _Lines, line: float) -> tuple[float, float, float]:
+    """The line, how much agrees with one shift above it and with the other one from it on, the least of the two, and
+    the most of what agrees on the sides that are not theirs.
+    """
+    least = min(before.share(line, above=True), after.share(line, above=False))
+    return line, least, max(before.share(line, above=False), after.share(line, above=True))
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """How much of the lines of tiles agrees with a shift: (rows,) their places in the image, what of them does, and
+    their structure.
+    """
+
+    y: Array
+    agreeing: Array
+    whole: Array
+
+    def share(self, line: float, *, above: bool) -> float:
+        """Part of the structure above a line, or from it on, that agrees."""
+        chosen = (self.y < line) == above
+        return float(self.agreeing[chosen].sum() / max(self.whole[chosen].sum(), 1e-30))
+
+
+def _sum_lines(reference: Reference, hypothesis: _Hypothesis) -> _Lines:
+    agreement = hypothesis.agreement
+    statistics = hypothesis.alignment.tile_statistics()
+    assert statistics is not None
+    top, side = (
+        float(values[1])
+        for values in (
+            _first_corner(reference, statistics, hypothesis.alignment),
+            reference.levels[-1].side,
+        )
+    )
+    informs = agreement.informs
+    y = top + side * (np.arange(len(informs)) + 0.5)
+    agreeing = np.asarray(np.sum(informs * ~agreement.disagrees, axis=1))
+    return _Lines(np.asarray(y, dtype=np.float64), agreeing, informs.sum(axis=1))
 
 
 def _is_near(alignment: Alignment, guess: Array, spread: Array) -> bool:

@@ -590,6 +590,11 @@ SIGNAL_SIGMAS = TABLE.derived(
     "SIGNAL_SIGMAS", 2.0, "standard errors",
     "By which a ring exceeds the noise where it holds signal: one in 44 rings of noise does.",
 )
+CERTAIN_SIGNAL_SIGMAS = TABLE.derived(
+    "CERTAIN_SIGNAL_SIGMAS", 4.0, "standard errors",
+    "Of one of the rings beside each other that hold signal: one in 660 spectra of noise has one of 48 (normal, one "
+    "side).",
+)
 GAUSSIAN_SIGMAS = TABLE.derived(
     "GAUSSIAN_SIGMAS", 3.5, "sigma",
     "At which the Gaussian is cut off: it has 0.2 % of its height there, exp(-3.5^2 / 2).",

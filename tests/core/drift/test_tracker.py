@@ -571,3 +571,23 @@ def test_a_stage_that_jumps_under_a_tool_is_not_denied_by_the_sigma(
         off = np.abs(update.drift_px - at)
         assert np.all((off < 0.1) | (off < 3.0 * update.sigma_px)), (k, update.reason)
     assert coasted >= 1 and update.accepted
+
+
+@pytest.mark.parametrize("ground", ["gold", "ridges"])
+@pytest.mark.parametrize(("jump_px", "line"), [(5.0, 0.35), (20.0, 0.45), (60.0, 0.35)])
+def test_a_stage_that_moves_within_a_frame_is_said_and_believed_when_it_stays(
+    ground: str, jump_px: float, line: float
+) -> None:
+    """The first lines are where they were predicted, as the specimen beside a tool would be."""
+    frames, drift, _ = draw(replace(KINDS[ground], jump_px=jump_px, jump_line=line), 301, 20)
+    tracker, said = DriftTracker(), {}
+    for k, frame in enumerate(frames):
+        update = tracker.update(frame, float(k))
+        off = np.abs(update.drift_px - drift[k])
+        assert np.all((off < 0.1) | (off < 3.0 * update.sigma_px)), (k, update.reason)
+        if "moved within the frame" in update.reason:
+            said[k] = int(update.reason.split("from line ")[1].split()[0])
+    assert list(said) == [15]
+    # Told by tiles, some of which show both.
+    assert abs(said[15] - line * len(frames[15])) < 32
+    assert update.accepted and np.all(off < 0.1)

@@ -23,8 +23,9 @@ import pytest
 
 from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.core.registration.noise_spectrum import passed_variance
+from semcal_ros.core.registration.noise_spectrum import measure_image, passed_variance
 from semcal_ros.core.registration.register import prepare_reference, register
+from semcal_ros.core.registration.thresholds import SIGNAL_MIN
 from semcal_ros.core.registration.tiles import (
     Pyramid,
     make_level,
@@ -55,6 +56,19 @@ def test_few_particles_reach_the_bound_with_a_sigma_that_holds() -> None:
     # From the scatter of eight scores alone, the sigma would be 2.5 times the bound.
     ratio = np.array(sigmas) / np.array(bounds)
     assert float(np.mean(ratio)) < 2.2
+
+
+def test_chance_at_high_frequencies_does_not_tell_the_smoothing_of_a_few_particles() -> None:
+    """Two particles of 4 px in the part whose spectrum is measured: structure is below 0.1 cycles per px."""
+    y, x = np.mgrid[:384, :384].astype(float)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        image = 60.0 + rng.normal(0.0, 11.5, (384, 384))
+        for place in rng.uniform(100.0, 280.0, (2, 2)):
+            image += 60.0 / (1.0 + np.exp((np.hypot(x - place[0], y - place[1]) - 4.0) / 0.6))
+        # Smoothed by less, the variance of a shift is three times the least and more.
+        found = measure_image(image.astype(np.float32))
+        assert found.sigma_px > 0.9 or found.signal_variance < SIGNAL_MIN * found.noise_variance
 
 
 def _discs(places: np.ndarray, rng: np.random.Generator, electrons: float = 60.0) -> np.ndarray:
