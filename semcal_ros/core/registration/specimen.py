@@ -62,11 +62,12 @@ from semcal_ros.core.registration.tiles import Pyramid
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A shift of those tiles that agree with it."""
+    """A shift of those tiles that agree with it; ``suspected`` are those where something moved in the image before."""
 
     alignment: Alignment
     agreement: Agreement
     start: CoarsePeak
+    suspected: Mask | None
 
 
 def look_at_whole(
@@ -160,7 +161,7 @@ def keep_specimen(
         if is_one and not any(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < SAME_SHIFT_PX for h in found
         ):
-            found.append(_Hypothesis(tried, agreement, start))
+            found.append(_Hypothesis(tried, agreement, start, judge.suspected))
             if follow_px is not None:
                 # Another one may be that of the part that is the specimen.
                 continue
@@ -206,7 +207,8 @@ class _Judge:
         level, self._noise = reference.levels[-1], noise
         self.latest: Agreement | None = None
         self._suspected: Mask | None = None
-        self._there: Mask | None = None
+        #: Of the tiles that were compared last.
+        self.suspected: Mask | None = None
         if suspected is not None:
             rows, cols = level.normal_matrices.shape[:2]
             x, y = (
@@ -225,8 +227,10 @@ class _Judge:
 
     def __call__(self, tiles: TileStatistics) -> Array:
         """Weights of the compared tiles."""
-        self._there = None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
-        self.latest = find_agreement(tiles, self._noise, self._there)
+        self.suspected = (
+            None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
+        )
+        self.latest = find_agreement(tiles, self._noise, self.suspected)
         return self.latest.weights
 
     @property
@@ -234,8 +238,8 @@ class _Judge:
         """Part of the structure that disagrees and did not do so in the image before."""
         assert self.latest is not None
         new, informs = self.latest.disagrees, self.latest.informs
-        if self._there is not None:
-            new = new & ~_with_neighbours(self._there)
+        if self.suspected is not None:
+            new = new & ~_with_neighbours(self.suspected)
         return float(informs[new].sum() / max(informs.sum(), 1e-30))
 
 
@@ -379,6 +383,9 @@ def _sum_lines(reference: Reference, hypothesis: _Hypothesis) -> _Lines:
         )
     )
     informs = agreement.informs
+    if hypothesis.suspected is not None:
+        # A tool agrees with neither shift.
+        informs = np.where(_with_neighbours(hypothesis.suspected), 0.0, informs)
     y = top + side * (np.arange(len(informs)) + 0.5)
     agreeing = np.asarray(np.sum(informs * ~agreement.disagrees, axis=1))
     return _Lines(np.asarray(y, dtype=np.float64), agreeing, informs.sum(axis=1))

@@ -573,13 +573,13 @@ def test_a_stage_that_jumps_under_a_tool_is_not_denied_by_the_sigma(
     assert coasted >= 1 and update.accepted
 
 
-@pytest.mark.parametrize("ground", ["gold", "ridges"])
+@pytest.mark.parametrize("scene", ["gold", "ridges", "tool over gold"])
 @pytest.mark.parametrize(("jump_px", "line"), [(5.0, 0.35), (20.0, 0.45), (60.0, 0.35)])
 def test_a_stage_that_moves_within_a_frame_is_said_and_believed_when_it_stays(
-    ground: str, jump_px: float, line: float
+    scene: str, jump_px: float, line: float
 ) -> None:
     """The first lines are where they were predicted, as the specimen beside a tool would be."""
-    frames, drift, _ = draw(replace(KINDS[ground], jump_px=jump_px, jump_line=line), 301, 20)
+    frames, drift, _ = draw(replace(KINDS[scene], jump_px=jump_px, jump_line=line), 301, 20)
     tracker, said = DriftTracker(), {}
     for k, frame in enumerate(frames):
         update = tracker.update(frame, float(k))
@@ -590,4 +590,5 @@ def test_a_stage_that_moves_within_a_frame_is_said_and_believed_when_it_stays(
     assert list(said) == [15]
     # Told by tiles, some of which show both.
     assert abs(said[15] - line * len(frames[15])) < 32
-    assert update.accepted and np.all(off < 0.1)
+    # What a part of the image does, a tool does as well as a stage: beside one the drift coasts on.
+    assert scene == "tool over gold" or (update.accepted and np.all(off < 0.1))
