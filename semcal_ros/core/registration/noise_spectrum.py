@@ -35,7 +35,6 @@ import scipy.fft
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
 from semcal_ros.core.registration.thresholds import (
-    CERTAIN_SIGNAL_SIGMAS,
     GAUSSIAN_SIGMAS,
     NOISE_BAND,
     NOISE_SPECTRUM_PX,
@@ -196,16 +195,10 @@ def measure_image(
 
 
 def _find_signal(power: Array, noise: float, count: Array) -> Array:
-    """Power of each ring above white noise; zero where it is not clearly above.
-
-    A ring's estimate scatters, and there are many: one counts with others beside it of which one is certain. Of a few
-    particles, chance at high frequencies would tell the smoothing.
-    """
-    deviations = (power - noise) / (noise * np.sqrt(2.0 / count))
-    may_be = deviations > SIGNAL_SIGMAS
-    run = np.cumsum(~may_be)
-    certain = np.unique(run[may_be & (deviations > CERTAIN_SIGNAL_SIGMAS)])
-    return np.where(may_be & np.isin(run, certain), power - noise, 0.0)
+    """Power of each ring above white noise; zero where it is not clearly above."""
+    # A ring's estimate scatters; what is not clearly above the noise is not signal.
+    scatter = noise * np.sqrt(2.0 / count)
+    return np.where(power - noise > SIGNAL_SIGMAS * scatter, power - noise, 0.0)
 
 
 @lru_cache(maxsize=32)

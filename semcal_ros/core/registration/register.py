@@ -85,6 +85,7 @@ from semcal_ros.core.registration.thresholds import (
     SIGNAL_SHARE_MIN,
     SPECIMEN_SHARE_MIN,
     TEXTURE_PX_MIN,
+    WEAK_SIGNAL_MIN,
 )
 from semcal_ros.core.registration.tiles import Pyramid, make_level
 
@@ -266,12 +267,15 @@ def prepare_reference(
         # A sparse specimen need not show anything there; the whole image decides.
         statistics = measure_image(gray, averaged, before)
     is_sparse = statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance
-    if is_sparse:
+    if statistics.signal_variance < WEAK_SIGNAL_MIN * statistics.noise_variance:
         # A few particles are a small part of the variance, and tell a shift as well as many.
         found = measure_richest_parts(gray, averaged, before)
-        if found.signal_variance < PARTS_SIGNAL_MIN * found.noise_variance:
+        if is_sparse and found.signal_variance < PARTS_SIGNAL_MIN * found.noise_variance:
             return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
-        statistics = replace(found, noise_variance=statistics.noise_variance)
+        # Of one or two of them in its middle, chance tells the smoothing as much as they do.
+        is_sparse = is_sparse or found.signal_variance > found.noise_variance
+        if is_sparse:
+            statistics = replace(found, noise_variance=statistics.noise_variance)
     levels = []
     for factor in _reduction_factors(gray.shape):
         level = make_level(pyramid, factor, statistics.sigma_px / factor)

@@ -104,6 +104,10 @@ SIGNAL_MIN = TABLE.derived(
     "Variance of the structure. Of images of noise, one in 50 of 96 px has more by chance, one in 200 of 128 px, and "
     "none of 10 000 of 192 px and more.",
 )
+WEAK_SIGNAL_MIN = TABLE.derived(
+    "WEAK_SIGNAL_MIN", 2.0 * SIGNAL_MIN, "of the variance of the noise",
+    "Below, a good part of it is chance; where the richest parts show more than noise, they tell the smoothing.",
+)
 PARTS_SIGNAL_MIN = TABLE.derived(
     "PARTS_SIGNAL_MIN", 0.3, "of the variance of the noise",
     "The same of the richest parts: those of 1550 images of noise, 192 to 768 px, had 0.21 at most.",
@@ -589,11 +593,6 @@ SMOOTHING_FREQUENCIES = TABLE.cost(
 SIGNAL_SIGMAS = TABLE.derived(
     "SIGNAL_SIGMAS", 2.0, "standard errors",
     "By which a ring exceeds the noise where it holds signal: one in 44 rings of noise does.",
-)
-CERTAIN_SIGNAL_SIGMAS = TABLE.derived(
-    "CERTAIN_SIGNAL_SIGMAS", 4.0, "standard errors",
-    "Of one of the rings beside each other that hold signal: one in 660 spectra of noise has one of 48 (normal, one "
-    "side).",
 )
 GAUSSIAN_SIGMAS = TABLE.derived(
     "GAUSSIAN_SIGMAS", 3.5, "sigma",
