@@ -621,12 +621,18 @@ def _register(
         moving = replace(moving, corner_px=moving.corner_px + np.array(inside[:2]))
     if isinstance(alignment, Rejection):
         named = _name_deformation(alignment, reference, pyramid)
+        if kept is None and named is not alignment:
+            # Most of its parts fit there.
+            suggested_px = np.array(peak.shift_px) + origin
         return Registration(unmeasured_alignment(), float("nan"), named, suggested_px=suggested_px)
     signals = _measure_signals(reference, image_noise, alignment)
     correlation = signals.correlation
     rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
     if rejection is not None:
-        rejection = _name_deformation(rejection, reference, pyramid)
+        named = _name_deformation(rejection, reference, pyramid)
+        if kept is None and named is not rejection:
+            suggested_px = np.array(peak.shift_px) + origin
+        rejection = named
     elif kept is None and whole is not None and whole.share < SPECIMEN_SHARE_MIN:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         rejection = Rejection(MatchFailure.AMBIGUOUS, reason)

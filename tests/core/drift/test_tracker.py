@@ -592,3 +592,15 @@ def test_a_stage_that_moves_within_a_frame_is_said_and_believed_when_it_stays(
     assert abs(said[15] - line * len(frames[15])) < 32
     # What a part of the image does, a tool does as well as a stage: beside one the drift coasts on.
     assert scene == "tool over gold" or (update.accepted and np.all(off < 0.1))
+
+
+@pytest.mark.parametrize("seed", [301, 302])
+def test_a_frame_whose_parts_fit_elsewhere_coasts_with_a_sigma_that_says_so(seed: int) -> None:
+    """A move by 5 px within a frame looks like a strain of a rough ground."""
+    kind = replace(KINDS["fractal"], jump_px=5.0, jump_line=0.4)
+    frames, drift, _ = draw(kind, seed, 16)
+    tracker = DriftTracker()
+    for k, frame in enumerate(frames):
+        update = tracker.update(frame, float(k))
+    assert "strained" in update.reason
+    assert np.all(np.abs(update.drift_px - drift[15]) < 3.0 * update.sigma_px)
