@@ -369,13 +369,14 @@ def _price(size: int) -> float:
 def _moves(
     sizes: Mapping[str, tuple[str, int]], limits: Mapping[str, int], terms: Sequence[str]
 ) -> dict[str, list[tuple[str, int]]]:
-    """Return to what each function may be changed in one step."""
+    """Return to what each function may be changed in one step. A constant is the same in both kinds."""
     moves = {}
     for name, limit in limits.items():
         least = 0 if name in terms else 1
         kinds = _POLYNOMIALS[:1] if name in SCAN_NAMES else _POLYNOMIALS
         options = [(kind, sizes[name][1] + more) for kind in kinds for more in (-1, 0, 1, 2)]
-        moves[name] = [o for o in options if least <= o[1] <= limit and o != sizes[name]]
+        options = [o for o in options if least <= o[1] <= limit and o != sizes[name]]
+        moves[name] = [o for o in options if o[1] > 1 or o[0] == _POLYNOMIALS[0]]
     return moves
 
 
