@@ -177,7 +177,7 @@ class Candidates:
         designs = with_shared(designs, shared)
         transposed = np.swapaxes(designs, 1, 2)
         self.matrices = transposed @ summary.information @ designs
-        self.rights = (transposed @ summary.right[:, :, None])[:, :, 0]
+        self.rights = _times(transposed, summary.right)
         prior_mean = np.concatenate([*means, summary.shared_mean])
         precision = np.concatenate([np.concatenate(sigmas) ** -2.0, summary.shared_precision])
         # The inner magnifications are predicted from the others, the two outermost ones from all.
@@ -334,18 +334,16 @@ def _find_better(
     def price(name: str, option: tuple[str, int]) -> float:
         return _cost(option) if name in free else _price(option[1])
 
-    gains = {
-        (name, option): fall - price(name, option) + price(name, sizes[name])
-        for (name, option), fall in falls.items()
+    dearer = {
+        (name, option): price(name, option) - price(name, sizes[name]) for name, option in falls
     }
     # Below, it may be rounding.
     score, least = candidates.score(sizes), 1e-6
-    for (name, option), gain in sorted(gains.items(), key=lambda item: -item[1]):
-        if gain <= least:
+    for change in sorted(falls, key=lambda change: dearer[change] - falls[change]):
+        if falls[change] - dearer[change] <= least:
             return None
-        changed = {**sizes, name: option}
-        dearer = price(name, option) - price(name, sizes[name])
-        if score - candidates.score(changed) - dearer > least:
+        changed = dict([*sizes.items(), change])
+        if score - candidates.score(changed) - dearer[change] > least:
             return changed
     return None
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
@@ -38,6 +37,7 @@ from semcal_ros.core.registration.agreement import (
     information_weights,
 )
 from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
     TileStatistics,
@@ -223,7 +223,7 @@ class _Judge:
         """Weights (rows, cols) to begin with, without what is suspected and what lies around it."""
         if self._suspected is None:
             return weights
-        return np.where(_with_neighbours(self._suspected), 0.0, weights)
+        return np.where(grow_mask(self._suspected, 1), 0.0, weights)
 
     def __call__(self, tiles: TileStatistics) -> Array:
         """Weights of the compared tiles."""
@@ -239,12 +239,8 @@ class _Judge:
         assert self.latest is not None
         new, informs = self.latest.disagrees, self.latest.informs
         if self.suspected is not None:
-            new = new & ~_with_neighbours(self.suspected)
+            new = new & ~grow_mask(self.suspected, 1)
         return float(informs[new].sum() / max(informs.sum(), 1e-30))
-
-
-def _with_neighbours(tiles: Mask) -> Mask:
-    return np.asarray(cv2.dilate(tiles.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _choose_followed(
@@ -385,7 +381,7 @@ def _sum_lines(reference: Reference, hypothesis: _Hypothesis) -> _Lines:
     informs = agreement.informs
     if hypothesis.suspected is not None:
         # A tool agrees with neither shift.
-        informs = np.where(_with_neighbours(hypothesis.suspected), 0.0, informs)
+        informs = np.where(grow_mask(hypothesis.suspected, 1), 0.0, informs)
     y = top + side * (np.arange(len(informs)) + 0.5)
     agreeing = np.asarray(np.sum(informs * ~agreement.disagrees, axis=1))
     return _Lines(np.asarray(y, dtype=np.float64), agreeing, informs.sum(axis=1))

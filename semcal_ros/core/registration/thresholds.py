@@ -104,7 +104,7 @@ SIGNAL_MIN = TABLE.derived(
     "Variance of the structure. Of images of noise, one in 50 of 96 px has more by chance, one in 200 of 128 px, and "
     "none of 10 000 of 192 px and more.",
 )
-WEAK_SIGNAL_MIN = TABLE.derived(
+WEAK_SIGNAL_MIN = TABLE.stated(
     "WEAK_SIGNAL_MIN", 2.0 * SIGNAL_MIN, "of the variance of the noise",
     "Below, a good part of it is chance; where the richest parts show more than noise, they tell the smoothing.",
 )
