@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Mask, mad_sigma
+from semcal_ros.core.arrays import Array, Mask, mad_sigma, median
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.agreement import (
     Agreement,
@@ -49,6 +49,7 @@ from semcal_ros.core.registration.inverse_compositional import (
     align,
     align_reweighted,
 )
+from semcal_ros.core.registration.noise_spectrum import normal_deviations, shared_pixels
 from semcal_ros.core.registration.periodicity import is_fine
 from semcal_ros.core.registration.thresholds import (
     ALONG_STARTS_PX,
@@ -140,6 +141,8 @@ class _Candidate:
         (rows, cols) variance of what the reference shows in them, in grey levels of the image.
     counted
         (rows, cols) the tiles that show the lattice there.
+    products
+        Number of independent values in a tile.
     is_held
         Whether it was only refined across the lines of a grating, since nothing tells a place along them there.
     """
@@ -148,6 +151,7 @@ class _Candidate:
     energies: Array
     structure: Array
     counted: Mask
+    products: float
     is_held: bool = False
 
     @property
@@ -271,7 +275,9 @@ def _compare_shifts(
         energies[tiles.rows, tiles.cols] = squares / tiles.pixels
         structure[tiles.rows, tiles.cols] = tiles.gain**2 * tiles.reference / tiles.pixels
         counted = shown.at(found.shift_px)
-        compared.append(_Candidate(found, energies, structure, counted, is_held))
+        # Of a tile that smoothing leaves with less than one, as of one.
+        products = max(1.0, median(tiles.pixels) / shared_pixels(tiles.sigma_px))
+        compared.append(_Candidate(found, energies, structure, counted, products, is_held))
     return compared
 
 
@@ -449,9 +455,8 @@ def _weigh(first: _Candidate, second: _Candidate) -> tuple[float, float]:
     finite = np.isfinite(difference) & first.counted & second.counted
     if not np.any(finite):
         return 0.0, 0.0
-    middle = float(np.median(difference[finite]))
-    deviations = (difference - middle) / max(mad_sigma(difference[finite] - middle), 1e-30)
-    deviations = np.where(finite, deviations, 0.0)
+    left = np.where(finite, difference - float(np.median(difference[finite])), 0.0)
+    deviations = normal_deviations(left / max(mad_sigma(left[finite]), 1e-30), first.products)
     return _count_defects(deviations), _count_defects(-deviations)
 
 

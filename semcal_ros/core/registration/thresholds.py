@@ -379,9 +379,9 @@ REPEATING_SHARE_MIN = TABLE.stated(
     "of 45 pictures 0.52 to 0.57, and in one, with a period of most of its width, all of it.",
 )
 DEFECT_SIGMAS = TABLE.derived(
-    "DEFECT_SIGMAS", 5.0, "robust sigma",
+    "DEFECT_SIGMAS", 5.0, "sigma",
     "By which one shift explains a tile better than another one where it is a defect: by chance one in 1.7 "
-    "million tiles, on either side.",
+    "million tiles, on either side, since deviations are those of a normal distribution that are as rare.",
 )
 DEFECT_EVIDENCE_MAX = TABLE.measured(
     "DEFECT_EVIDENCE_MAX", 30.0, "squared sigmas",

@@ -16,13 +16,17 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 import pytest
+from scipy import integrate, optimize, stats
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.registration.defects import _Candidate, _find_least_evidence
+from semcal_ros.core.registration.defects import _Candidate, _find_least_evidence, _weigh
 from semcal_ros.core.registration.inverse_compositional import Alignment, align
+from semcal_ros.core.registration.noise_spectrum import normal_deviations
 from semcal_ros.core.registration.register import Registration, prepare_reference, register_pair
 from semcal_ros.core.registration.specimen import noise_beside_tools
 from semcal_ros.core.registration.thresholds import DEFECT_EVIDENCE_MAX, EVIDENCE_MIN
@@ -144,11 +148,48 @@ def test_defects_that_are_left_unexplained_ask_for_more_evidence() -> None:
         found = align([level], pyramid, start)
         assert isinstance(found, Alignment)
         zeros, ones = np.zeros(everywhere.shape), np.ones(everywhere.shape)
-        candidate = _Candidate(found, zeros, ones, everywhere)
+        candidate = _Candidate(found, zeros, ones, everywhere, 10.0)
         least.append(_find_least_evidence(candidate, noise))
     # Two defects, and one more than the four that the second shift does not explain.
     assert least[0] == EVIDENCE_MIN
     assert least[1] == 5.0 * DEFECT_EVIDENCE_MAX
+
+
+@pytest.mark.parametrize("products", [8, 15, 40])
+def test_long_tails_of_mean_squares_are_known(products: int) -> None:
+    """A difference of two sums of squares is one of two gamma variables; its tails by integration."""
+    half = stats.gamma(products / 2.0)
+
+    def beyond(deviation: float) -> float:
+        whole = integrate.quad(lambda x: half.pdf(x) * half.sf(x + deviation), 0.0, np.inf)
+        return float(whole[0])
+
+    median = optimize.brentq(lambda deviation: beyond(deviation) - 0.25, 0.01, 10.0)
+    deviations = np.array([2.0, 3.0, 4.0, 5.0, 6.0])
+    robust = deviations * median / stats.norm.isf(0.25)
+    expected = [stats.norm.isf(beyond(deviation)) for deviation in robust]
+    found = normal_deviations(np.concatenate([deviations, -deviations]), products)
+    # What the saddlepoint approximation is good for.
+    np.testing.assert_allclose(found[:5], expected, atol=0.04)
+    np.testing.assert_array_equal(found[5:], -found[:5])
+    # A normal one of 5 sigmas is far rarer.
+    assert expected[3] < 4.6
+
+
+def test_chance_is_no_defect() -> None:
+    """Mean squares of 15 values in 784 tiles: some fifteen of all stand out by 5 robust sigmas, though of normal ones
+    hardly any would.
+    """
+    tiles, everywhere = (500, 28, 28), np.ones((28, 28), dtype=bool)
+    rng = np.random.default_rng(1)
+    first, second = rng.chisquare(15.0, (2, *tiles)) / 15.0
+    alignment = cast("Alignment", None)
+    evidence = 0.0
+    for pair in zip(first, second, strict=True):
+        shifts = [_Candidate(alignment, own, own, everywhere, 15.0) for own in pair]
+        evidence += sum(_weigh(*shifts))
+    # A quarter of a tile is expected; more than three are seen once in ten thousand times.
+    assert evidence <= 3.0 * DEFECT_EVIDENCE_MAX
 
 
 def draw_pores(
