@@ -17,8 +17,9 @@
 All shifts that differ by a period show a perfect lattice alike. Defects decide: at a wrong shift, every defect
 disagrees twice, where it is and where it should be. Of a disordered lattice, such as the pores of anodic alumina, each
 cell is a little defect: at a wrong shift, most tiles disagree by a part of their structure. What neither tells is
-refused where the lattice is fine, since a prediction would only hide a jump by a period. Where a period is a good part
-of the field, a jump by one is a move of the stage and no drift, and a prediction that is good to a tenth of it decides.
+refused where the lattice is fine, since a prediction would only hide a jump by a period; one defect is enough that
+agrees with it. Where a period is a good part of the field, a jump by one is a move of the stage and no drift, and a
+prediction that is good to a tenth of it decides.
 
 What does not repeat in an image by itself, such as a tool over the lattice, has no say: where either image does not
 show the lattice, or next to it, tiles count neither for the refinement nor as defects. A tool moves by itself, and its
@@ -29,7 +30,7 @@ explain, which was not among the compared ones: more defects have to speak for a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -60,6 +61,7 @@ from semcal_ros.core.registration.thresholds import (
     DISORDERED_TILES_MIN,
     EVIDENCE_MIN,
     HALF_PERIOD_SIGMAS,
+    LONE_DEFECT_MOVED_PX_MIN,
     NOISE_DOUBT,
     PERIODS_COMPARED_MAX,
     PERIODS_REACH_SIGMAS,
@@ -212,13 +214,14 @@ def choose_period(
             pro < contra and not _is_worse_everywhere(other, best)
         ):
             best = other
-    predicted = _find_predicted(compared, periods, guess, spread, level.size)
-    if predicted is not None and (predicted is best or not _tells(best, predicted, EVIDENCE_MIN)):
-        return _find_flaw(predicted, periods, noise) or _leave_out(pyramid, predicted, noise, shown)
+    predicted = _find_predicted(compared, periods, guess, spread)
+    usual = None if is_fine(periods, level.size) else predicted
+    if usual is not None and (usual is best or not _tells(best, usual, EVIDENCE_MIN)):
+        return _find_flaw(usual, periods, noise) or _leave_out(pyramid, usual, noise, shown)
     flaw = _find_flaw(best, periods, noise)
     if flaw is not None:
         return flaw
-    least = _find_least_evidence(best, noise)
+    least = _find_least_evidence(best, noise, best is predicted)
     x, y = best.shift_px.tolist()
     for other in compared:
         if other is not best and not _tells(best, other, least):
@@ -335,11 +338,16 @@ def _leave_out(
         return ChosenShift(found.alignment, agreement)
     latest = [agreement]
 
-    def judge(tiles: TileStatistics) -> Array:
-        latest[:] = [find_agreement(tiles, noise)]
-        return latest[0].weights
-
     shift = found.shift_px
+    lattice = shown.at(shift)
+
+    def judge(tiles: TileStatistics) -> Array:
+        own = find_agreement(tiles, noise)
+        # A tool without structure disagrees with nothing.
+        counted = np.where(lattice[tiles.rows, tiles.cols], own.weights, 0.0)
+        latest[:] = [replace(own, weights=counted)]
+        return counted
+
     weights = _weigh_tiles(shown, shift, noise)
     alignment = align_reweighted(
         shown.level, pyramid, shift, weights, noise.reference, judge, looks=False
@@ -354,8 +362,11 @@ def _leave_out(
     return ChosenShift(alignment, latest[0])
 
 
-def _find_least_evidence(best: _Candidate, noise: TileNoise) -> float:
-    """Evidence that has to speak for a shift: two defects, and more than are left unexplained there."""
+def _find_least_evidence(best: _Candidate, noise: TileNoise, is_predicted: bool) -> float:
+    """Evidence that has to speak for a shift: two defects, and more than are left unexplained there.
+
+    One is enough for a shift that was predicted, but not near zero: what is none of the specimen stays in its place.
+    """
     tiles = best.alignment.tile_statistics()
     assert tiles is not None
     disagrees = np.zeros_like(best.counted)
@@ -363,20 +374,18 @@ def _find_least_evidence(best: _Candidate, noise: TileNoise) -> float:
     labels, bodies = cv2.connectedComponents(disagrees.astype(np.uint8), connectivity=8)
     # What has a part that is not of the lattice is no defect of it.
     defects = np.setdiff1d(np.arange(1, labels), bodies[~best.counted])
-    return max(EVIDENCE_MIN, DEFECT_EVIDENCE_MAX * (len(defects) + 1))
+    moved = float(np.hypot(*best.shift_px)) > LONE_DEFECT_MOVED_PX_MIN
+    least = DEFECT_EVIDENCE_MAX if is_predicted and moved else EVIDENCE_MIN
+    return max(least, DEFECT_EVIDENCE_MAX * (len(defects) + 1))
 
 
 def _find_predicted(
-    compared: list[_Candidate],
-    periods: Array,
-    guess: Array,
-    spread: Array | None,
-    size: tuple[int, int],
+    compared: list[_Candidate], periods: Array, guess: Array, spread: Array | None
 ) -> _Candidate | None:
-    """The shift that a prediction tells; None where the lattice is fine, or the prediction not good enough. One that
-    was not refined along lines is none.
+    """The shift that a prediction tells; None where it is not good enough. One that was not refined along lines is
+    none.
     """
-    if spread is None or is_fine(periods, size):
+    if spread is None:
         return None
     shortest = float(np.min(np.hypot(*periods.T)))
     sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))

@@ -393,6 +393,10 @@ EVIDENCE_MIN = TABLE.derived(
     "EVIDENCE_MIN", 2.0 * DEFECT_EVIDENCE_MAX, "squared sigmas",
     "That tells two shifts apart: two defects.",
 )
+LONE_DEFECT_MOVED_PX_MIN = TABLE.stated(
+    "LONE_DEFECT_MOVED_PX_MIN", 1.0, "px",
+    "Of the specimen, so that one defect alone tells a predicted shift: one that is none of the specimen's stays.",
+)
 DISORDER_MIN = TABLE.stated(
     "DISORDER_MIN", 0.05, "of the structure",
     "That a wrong shift of a disordered lattice leaves of a tile: cells displaced by 0.6 of 16 px leave 0.14 to 0.17 "

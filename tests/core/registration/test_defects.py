@@ -149,10 +149,70 @@ def test_defects_that_are_left_unexplained_ask_for_more_evidence() -> None:
         assert isinstance(found, Alignment)
         zeros, ones = np.zeros(everywhere.shape), np.ones(everywhere.shape)
         candidate = _Candidate(found, zeros, ones, everywhere, 10.0)
-        least.append(_find_least_evidence(candidate, noise))
+        least.append(_find_least_evidence(candidate, noise, False))
     # Two defects, and one more than the four that the second shift does not explain.
     assert least[0] == EVIDENCE_MIN
     assert least[1] == 5.0 * DEFECT_EVIDENCE_MAX
+
+
+def draw_beside_tool(shift: Array, defects: Array, edge_px: int, rng: np.random.Generator) -> Array:
+    """A lattice in electrons, 120 for a brightness of one, and on the left a bright tool with bands across."""
+    picture = 0.3 + 0.15 * draw_lattice(8.0, 0.3, shift, defects, contrast=0.8)
+    picture[:, :edge_px] = 0.75 + 0.1 * np.sin(np.arange(SIZE) / 7.0)[:, None]
+    return np.asarray(rng.poisson(120.0 * picture) / 0.6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tool_without_structure_does_not_pull_the_shift(seed: int) -> None:
+    """Its inside agrees with any shift, and its bands would tell one of their own."""
+    rng = np.random.default_rng(seed)
+    shift = rng.uniform(-4.0, 4.0, 2)
+    defects = np.array([[135.0, 45.0], [115.0, 95.0], [140.0, 145.0]])
+    first = draw_beside_tool(np.zeros(2), defects, 60, rng)
+    second = draw_beside_tool(shift, defects, 63, rng)
+    found = register_pair(first, second, guess_px=shift, guess_covariance=0.09 * np.eye(2))
+    assert found.accepted, found.reason
+    error = found.shift_px - shift
+    assert np.max(np.abs(error)) < 0.1
+    assert error @ np.linalg.solve(found.covariance, error) < stats.chi2.isf(1e-4, 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_defect_tells_the_shift_that_was_predicted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shift = rng.uniform(1.5, 4.0, 2) * rng.choice([-1, 1], 2)
+    defects = rng.uniform(50.0, 140.0, (1, 2))
+    first, second = (draw_lattice(8.0, 0.3, at, defects) for at in (np.zeros(2), shift))
+    found = compare(first, second, shift + rng.normal(0.0, 0.2, 2), 0.3)
+    assert found.accepted, found.reason
+    np.testing.assert_allclose(found.shift_px, shift, atol=0.03)
+    # Nothing predicts that far, and one defect alone may be none.
+    assert "ambiguous" in compare(first, second, shift, 10.0).reason
+
+
+@pytest.mark.parametrize("jump", [(1, 1), (1, -1), (0, -2), (3, -1)])
+@pytest.mark.parametrize("defects", [0, 1, 2])
+def test_a_prediction_hides_no_jump_by_a_period(jump: tuple[int, int], defects: int) -> None:
+    rng = np.random.default_rng(defects)
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    shift = np.array([2.1, -1.4])
+    at = shift + 8.0 * turn @ np.array(jump)
+    places = rng.uniform(60.0, 130.0, (defects, 2))
+    first, second = draw_lattice(8.0, 0.3, np.zeros(2), places), draw_lattice(8.0, 0.3, at, places)
+    found = compare(first, second, shift, 0.3)
+    assert not found.accepted or np.max(np.abs(found.shift_px - at)) < 0.1
+
+
+@pytest.mark.parametrize("jump", [(1, 1), (0, 2)])
+def test_a_spot_that_stays_is_no_defect_that_tells_a_prediction(jump: tuple[int, int]) -> None:
+    """Dirt of a detector over a perfect lattice: the stage moves by a period, and the spot does not."""
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    spot = np.array([[90.0, 100.0]])
+    for shift in (np.array([0.3, 0.2]), np.array([0.9, -0.3]), np.array([1.5, 1.0])):
+        at = shift + 8.0 * turn @ np.array(jump)
+        pair = [draw_lattice(8.0, 0.3, where, spot - where) for where in (np.zeros(2), at)]
+        found = compare(pair[0], pair[1], shift, 0.3)
+        assert not found.accepted, (shift, found.shift_px)
 
 
 @pytest.mark.parametrize("products", [8, 15, 40])
