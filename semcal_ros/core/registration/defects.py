@@ -79,6 +79,22 @@ class ChosenShift:
 
 
 @dataclass(frozen=True)
+class UntoldShift:
+    """Why no shift of a periodic specimen is told.
+
+    Attributes
+    ----------
+    rejection
+        The reason.
+    suggested_px
+        (2,) the shift for which more defects speak than for the one nearest to the prediction; NaN where none does.
+    """
+
+    rejection: Rejection[MatchFailure]
+    suggested_px: Array
+
+
+@dataclass(frozen=True)
 class _Shown:
     """Where a reference and an image show the lattice, and all around.
 
@@ -172,7 +188,7 @@ def choose_period(
     spread: Array | None,
     noise: TileNoise,
     repeats: tuple[Mask, Mask],
-) -> ChosenShift | Rejection[MatchFailure]:
+) -> ChosenShift | UntoldShift:
     """The shift of a periodic specimen that its defects tell, or why it is not told.
 
     Parameters
@@ -198,14 +214,15 @@ def choose_period(
     shown = _Shown.of(level, *repeats)
     first = _refine_first(pyramid, start_px, noise, shown)
     if isinstance(first, Rejection):
-        return first
+        return UntoldShift(first, np.full(2, np.nan))
     shifts = [*_list_shifts(first.shift_px, periods, guess, spread, level.size)]
     if shown.is_all:
         # The highest correlation is no tool's.
         shifts.append(highest_px)
     compared = _compare_shifts(pyramid, shifts, noise, shown)
     if not compared:
-        return Rejection(MatchFailure.NOT_CONVERGED, "refinement did not converge at any period")
+        reason = "refinement did not converge at any period"
+        return UntoldShift(Rejection(MatchFailure.NOT_CONVERGED, reason), np.full(2, np.nan))
 
     best = compared[0]
     for other in compared[1:]:
@@ -217,26 +234,38 @@ def choose_period(
     predicted = _find_predicted(compared, periods, guess, spread)
     usual = None if is_fine(periods, level.size) else predicted
     if usual is not None and (usual is best or not _tells(best, usual, EVIDENCE_MIN)):
-        return _find_flaw(usual, periods, noise) or _leave_out(pyramid, usual, noise, shown)
-    flaw = _find_flaw(best, periods, noise)
-    if flaw is not None:
-        return flaw
-    least = _find_least_evidence(best, noise, best is predicted)
-    x, y = best.shift_px.tolist()
-    for other in compared:
-        if other is not best and not _tells(best, other, least):
-            a, b = other.shift_px.tolist()
-            return Rejection(
-                MatchFailure.AMBIGUOUS,
-                f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, whose defects do not tell "
-                f"shifts ({x:.1f}, {y:.1f}) and ({a:.1f}, {b:.1f}) px apart",
-            )
-    if len(compared) == 1:
-        return Rejection(
-            MatchFailure.AMBIGUOUS,
-            f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, and only one shift to compare",
+        best, rejection = usual, _find_flaw(usual, periods, noise)
+    else:
+        rejection = _find_flaw(best, periods, noise) or _find_rival(
+            best, compared, periods, noise, best is predicted
         )
-    return _leave_out(pyramid, best, noise, shown)
+    told = rejection or _leave_out(pyramid, best, noise, shown)
+    if isinstance(told, ChosenShift):
+        return told
+    nearest = min(compared, key=lambda c: float(np.hypot(*(c.shift_px - guess))))
+    return UntoldShift(told, np.full(2, np.nan) if best is nearest else best.shift_px)
+
+
+def _find_rival(
+    best: _Candidate,
+    compared: list[_Candidate],
+    periods: Array,
+    noise: TileNoise,
+    is_predicted: bool,
+) -> Rejection[MatchFailure] | None:
+    """Why defects do not tell the best shift from all others; None if they do."""
+    least = _find_least_evidence(best, noise, is_predicted)
+    start = f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, "
+    if len(compared) == 1:
+        return Rejection(MatchFailure.AMBIGUOUS, start + "and only one shift to compare")
+    rival = next((c for c in compared if c is not best and not _tells(best, c, least)), None)
+    if rival is None:
+        return None
+    (x, y), (a, b) = best.shift_px.tolist(), rival.shift_px.tolist()
+    shifts = f"({x:.1f}, {y:.1f}) and ({a:.1f}, {b:.1f})"
+    return Rejection(
+        MatchFailure.AMBIGUOUS, start + f"whose defects do not tell shifts {shifts} px apart"
+    )
 
 
 def _find_flaw(

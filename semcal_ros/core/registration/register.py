@@ -543,6 +543,7 @@ def _register(
             "ambiguous: a specimen that repeats, so that a part of it does not say by how many periods it moved",
         )
     chosen: tuple[CoarsePeak, Alignment | None] | Rejection[MatchFailure]
+    suggested_px = np.full(2, np.nan)
     if repeats:
         finest = find_coarse_peaks(reference.coarse, pyramid, guess, finest=True) or peaks
         # Periods are not known well enough to be counted far.
@@ -567,7 +568,7 @@ def _register(
             moving = find_moving(reference, told.alignment, told.agreement)
             share = told.agreement.share
         else:
-            chosen = told
+            chosen, suggested_px = told.rejection, told.suggested_px + origin
     elif of_parts:
         chosen = peaks[0], None
     else:
@@ -611,12 +612,15 @@ def _register(
     if kept is None and isinstance(chosen, Rejection):
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
         nearest = np.array(peaks[int(np.argmin(distances))].shift_px) + origin
-        return Registration(unmeasured_alignment(), float("nan"), chosen, nearest)
+        return Registration(
+            unmeasured_alignment(), float("nan"), chosen, nearest, suggested_px=suggested_px
+        )
     if whole is not None:
         share = whole.share
     if kept is not None:
         alignment, peak, moving, share = kept.alignment, kept.peak, kept.moving, kept.share
-    suggested_px = np.full(2, np.nan) if kept is None else kept.other_px + origin
+    if kept is not None:
+        suggested_px = kept.other_px + origin
     if moving is not None:
         moving = replace(moving, corner_px=moving.corner_px + np.array(inside[:2]))
     if isinstance(alignment, Rejection):
