@@ -87,7 +87,8 @@ class UntoldShift:
     rejection
         The reason.
     suggested_px
-        (2,) the shift for which more defects speak than for the one nearest to the prediction; NaN where none does.
+        (2,) the shift for which more defects speak than for the one nearest to the prediction; NaN where there is none,
+        or where defects are left that say that the specimen is farther away than what was compared.
     """
 
     rejection: Rejection[MatchFailure]
@@ -236,14 +237,14 @@ def choose_period(
     if usual is not None and (usual is best or not _tells(best, usual, EVIDENCE_MIN)):
         best, rejection = usual, _find_flaw(usual, periods, noise)
     else:
-        rejection = _find_flaw(best, periods, noise) or _find_rival(
-            best, compared, periods, noise, best is predicted
-        )
+        rejection = _find_flaw(best, periods, noise)
+        rejection = rejection or _find_rival(best, compared, periods, noise, best is predicted)
     told = rejection or _leave_out(pyramid, best, noise, shown)
     if isinstance(told, ChosenShift):
         return told
     nearest = min(compared, key=lambda c: float(np.hypot(*(c.shift_px - guess))))
-    return UntoldShift(told, np.full(2, np.nan) if best is nearest else best.shift_px)
+    is_open = best is nearest or told.status is MatchFailure.DISSIMILAR
+    return UntoldShift(told, np.full(2, np.nan) if is_open else best.shift_px)
 
 
 def _find_rival(
@@ -254,7 +255,8 @@ def _find_rival(
     is_predicted: bool,
 ) -> Rejection[MatchFailure] | None:
     """Why defects do not tell the best shift from all others; None if they do."""
-    least = _find_least_evidence(best, noise, is_predicted)
+    left = _count_left_defects(best, noise)
+    least = _find_least_evidence(best, left, is_predicted)
     start = f"ambiguous: a specimen that repeats every {np.hypot(*periods[0]):.1f} px, "
     if len(compared) == 1:
         return Rejection(MatchFailure.AMBIGUOUS, start + "and only one shift to compare")
@@ -263,9 +265,11 @@ def _find_rival(
         return None
     (x, y), (a, b) = best.shift_px.tolist(), rival.shift_px.tolist()
     shifts = f"({x:.1f}, {y:.1f}) and ({a:.1f}, {b:.1f})"
-    return Rejection(
-        MatchFailure.AMBIGUOUS, start + f"whose defects do not tell shifts {shifts} px apart"
-    )
+    reason = start + f"whose defects do not tell shifts {shifts} px apart"
+    if DEFECT_EVIDENCE_MAX * left >= EVIDENCE_MIN:
+        reason += f", and {left} defects lie elsewhere"
+        return Rejection(MatchFailure.DISSIMILAR, reason)
+    return Rejection(MatchFailure.AMBIGUOUS, reason)
 
 
 def _find_flaw(
@@ -391,21 +395,25 @@ def _leave_out(
     return ChosenShift(alignment, latest[0])
 
 
-def _find_least_evidence(best: _Candidate, noise: TileNoise, is_predicted: bool) -> float:
+def _find_least_evidence(best: _Candidate, left: int, is_predicted: bool) -> float:
     """Evidence that has to speak for a shift: two defects, and more than are left unexplained there.
 
     One is enough for a shift that was predicted, but not near zero: what is none of the specimen stays in its place.
     """
+    moved = float(np.hypot(*best.shift_px)) > LONE_DEFECT_MOVED_PX_MIN
+    least = DEFECT_EVIDENCE_MAX if is_predicted and moved else EVIDENCE_MIN
+    return max(least, DEFECT_EVIDENCE_MAX * (left + 1))
+
+
+def _count_left_defects(best: _Candidate, noise: TileNoise) -> int:
+    """Return how many defects a shift leaves unexplained."""
     tiles = best.alignment.tile_statistics()
     assert tiles is not None
     disagrees = np.zeros_like(best.counted)
     disagrees[tiles.rows, tiles.cols] = find_agreement(tiles, noise).disagrees
     labels, bodies = cv2.connectedComponents(disagrees.astype(np.uint8), connectivity=8)
     # What has a part that is not of the lattice is no defect of it.
-    defects = np.setdiff1d(np.arange(1, labels), bodies[~best.counted])
-    moved = float(np.hypot(*best.shift_px)) > LONE_DEFECT_MOVED_PX_MIN
-    least = DEFECT_EVIDENCE_MAX if is_predicted and moved else EVIDENCE_MIN
-    return max(least, DEFECT_EVIDENCE_MAX * (len(defects) + 1))
+    return len(np.setdiff1d(np.arange(1, labels), bodies[~best.counted]))
 
 
 def _find_predicted(

@@ -24,7 +24,13 @@ import pytest
 from scipy import integrate, optimize, stats
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.registration.defects import _Candidate, _find_least_evidence, _weigh
+from semcal_ros.core.registration.defects import (
+    _Candidate,
+    _count_left_defects,
+    _find_least_evidence,
+    _weigh,
+)
+from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import Alignment, align
 from semcal_ros.core.registration.noise_spectrum import normal_deviations
 from semcal_ros.core.registration.register import Registration, prepare_reference, register_pair
@@ -149,7 +155,7 @@ def test_defects_that_are_left_unexplained_ask_for_more_evidence() -> None:
         assert isinstance(found, Alignment)
         zeros, ones = np.zeros(everywhere.shape), np.ones(everywhere.shape)
         candidate = _Candidate(found, zeros, ones, everywhere, 10.0)
-        least.append(_find_least_evidence(candidate, noise, False))
+        least.append(_find_least_evidence(candidate, _count_left_defects(candidate, noise), False))
     # Two defects, and one more than the four that the second shift does not explain.
     assert least[0] == EVIDENCE_MIN
     assert least[1] == 5.0 * DEFECT_EVIDENCE_MAX
@@ -202,8 +208,10 @@ def test_a_prediction_hides_no_jump_by_a_period(jump: tuple[int, int], defects: 
     found = compare(first, second, shift, 0.3)
     if found.accepted:
         np.testing.assert_allclose(found.shift_px, at, atol=0.1)
+    elif found.rejection is not None and found.rejection.status is MatchFailure.DISSIMILAR:
+        assert defects, found.reason
     elif defects:
-        # It is not believed, nor may it be compared at all, but that the specimen is elsewhere is said.
+        # It is not believed, but that the specimen is elsewhere is said.
         assert 3.0 * np.hypot(*(found.suggested_px - shift)) > np.hypot(*(at - shift))
     else:
         assert np.all(np.isnan(found.suggested_px))
