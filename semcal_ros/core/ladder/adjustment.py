@@ -33,6 +33,7 @@ from semcal_ros.core.calibration.estimator.trust_region import Descent, DescentS
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.core.ladder.residuals import Link, pair_rows, pair_values
 from semcal_ros.core.ladder.thresholds import (
+    COMPARING_STEPS,
     CREEP_SIGMA,
     DRIFT_FIRST_PX,
     DRIFT_MAX,
@@ -197,6 +198,12 @@ def adjust(
     return settled if is_as_good and len(settled.kept) >= len(fit.kept) else fit
 
 
+def cost_after_few_steps(setup: LadderSetup, state: LadderState, links: Sequence[Link]) -> float:
+    """Return half the sum of squares near the minimum, to compare starts; infinite where there is no camera."""
+    drift = DriftSpread(DRIFT_FIRST_PX, DRIFT_FIRST_PX)
+    return _descend(setup, state, share_noise(setup, links), drift, (), COMPARING_STEPS).cost
+
+
 def _adjust(
     setup: LadderSetup,
     state: LadderState,
@@ -316,6 +323,7 @@ def _descend(
     links: Sequence[Link],
     drift: DriftSpread,
     jumps: tuple[int, ...],
+    most_steps: int = FIT_STEPS,
 ) -> Descent[LadderState]:
     information = prior_information(setup, drift, jumps)
 
@@ -352,7 +360,7 @@ def _descend(
         state,
         cost_of(state),
         linearise,
-        max_iterations=FIT_STEPS,
+        max_iterations=most_steps,
         tolerance=FIT_TOLERANCE,
         # The correspondences give poses to a fraction of a pixel, from where the problem is nearly linear.
         first_damping=DAMPING_MIN,

@@ -34,7 +34,7 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel, columns_o
 from semcal_ros.core.camera.records import LadderRecord, Relay
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
-from semcal_ros.core.ladder.adjustment import LadderFit, adjust
+from semcal_ros.core.ladder.adjustment import LadderFit, adjust, cost_after_few_steps
 from semcal_ros.core.ladder.agreement import (
     FLIPS,
     Flip,
@@ -309,13 +309,20 @@ class _Ladder:
         """(width, height) of the calibration, px."""
         return self.model.image_width, self.model.image_height
 
-    def adjust(self, used: Sequence[int], matches: Sequence[Match]) -> _Fitted:
-        """Adjust the pictures that are used, by the matches between them."""
+    def start(
+        self, used: Sequence[int], matches: Sequence[Match]
+    ) -> tuple[LadderSetup, LadderState, tuple[Link, ...]]:
+        """Make the setup of the pictures that are used, the first state, and the matches between them."""
         number_of = {number: k for k, number in enumerate(used)}
         setup = make_setup(self.model, tuple(self.places[k] for k in used), self.size)
         own = [match for match in matches if {match.first, match.second} <= set(number_of)]
         state = _start(setup, own, number_of, self.scale)
         links = tuple(_link(setup, match, number_of, self.scale, self.times) for match in own)
+        return setup, state, links
+
+    def adjust(self, used: Sequence[int], matches: Sequence[Match]) -> _Fitted:
+        """Adjust the pictures that are used, by the matches between them."""
+        setup, state, links = self.start(used, matches)
         return _Fitted(setup, adjust(setup, state, links), links)
 
 
@@ -363,7 +370,9 @@ def _adjust_as_they_lie(
     ):
         return fitted, notes
     as_it_is = np.inf if fitted is None else fitted.minus_log_evidence
-    others = [(_adjust_flipped(ladder, used, matches, flip), flip) for flip in FLIPS]
+    # No adjustment makes up for a start that is far worse.
+    most = cost_after_few_steps(*ladder.start(used, matches)) + EVIDENCE_SURE
+    others = [(_adjust_flipped(ladder, used, matches, flip, most), flip) for flip in FLIPS]
     least, likely = min(others, key=lambda one: one[0])
     if least < as_it_is - EVIDENCE_SURE:
         raise CalibrationError(
@@ -380,11 +389,20 @@ def _adjust_as_they_lie(
 
 
 def _adjust_flipped(
-    ladder: _Ladder, used: Sequence[int], matches: Sequence[Match], flip: Flip
+    ladder: _Ladder,
+    used: Sequence[int],
+    matches: Sequence[Match],
+    flip: Flip,
+    most_cost: float,
 ) -> float:
-    """Minus twice the log evidence of flipped pictures; infinite if they show no ladder."""
+    """Minus twice the log evidence of flipped pictures; infinite if they show no ladder, or the first steps leave more
+    cost than ``most_cost``.
+    """
+    flipped = [flip_match(match, flip) for match in matches]
+    if cost_after_few_steps(*ladder.start(used, flipped)) > most_cost:
+        return np.inf
     try:
-        fitted = ladder.adjust(used, [flip_match(match, flip) for match in matches])
+        fitted = ladder.adjust(used, flipped)
         check_fit(fitted.setup, fitted.fit, fitted.links)
     except CalibrationError:
         return np.inf
