@@ -58,19 +58,18 @@ def relative_scale_sigma(camera: ScanCamera | None) -> float:
 
 
 def centre_covariance(camera: ScanCamera | None) -> Array:
-    """(2, 2) covariance in px^2 of the camera's principal point; zero where it is known exactly."""
+    """(2, 2) covariance of the camera's principal point, in half widths of the raster; zero where that is exact."""
     if camera is None or camera.covariance is None:
         return np.zeros((2, 2))
-    return np.asarray(camera.covariance[_CENTRE, _CENTRE])
+    return np.asarray(camera.covariance[_CENTRE, _CENTRE]) / camera.norm_px**2
 
 
 def apparent_zoom_shift(before: ScanCamera, after: ScanCamera) -> Array:
-    """(2, 2) metres that a change of magnification seems to move the specimen by, the other way, per
-    px of error of the principal point that both cameras share.
+    """(2, 2) metres that a change of magnification seems to move the specimen by, the other way, per half width of the
+    raster of error of the principal point that both cameras share. Another number of pixels is no such change.
     """
-    return np.asarray(
-        np.linalg.inv(after.ideal_from_sem_jacobian) - np.linalg.inv(before.ideal_from_sem_jacobian)
-    )
+    by_error = [np.linalg.inv(c.ideal_from_sem_jacobian) * c.norm_px for c in (before, after)]
+    return np.asarray(by_error[1] - by_error[0])
 
 
 def zoom_covariance(before: ScanCamera, after: ScanCamera) -> Array:

@@ -89,6 +89,11 @@ class ScanFrame:
         return np.eye(2) if self.camera is None else self.camera.rectified.ideal_from_sem_jacobian
 
     @property
+    def field_height(self) -> float:
+        """Height of the field in units of the drift."""
+        return float(self.size[1] / np.sqrt(abs(np.linalg.det(self.px_from_unit))))
+
+    @property
     def acquisition_time_s(self) -> float:
         """Time that it took, s."""
         return 0.0 if self.timing is None else self.timing.acquisition_time_s

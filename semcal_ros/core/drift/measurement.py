@@ -100,7 +100,11 @@ def make_measurement(
     floor = np.diag([SHIFT_FLOOR_PX**2] * 2 + [shear_floor] * 2)
     joint = share * registration.alignment.joint_covariance + floor
     shift = both @ registration.alignment.joint_px + np.append(term_s2 * removed[2:], removed[:2])
-    ratio = 1.0 if before.timing is None else before.timing.frame_time_s / frame_s
+    ratio = 1.0
+    if before.timing is not None:
+        # What is left of the keyframe's shear is over its field; this frame shows a part of it.
+        part_of_field = now.field_height / before.field_height
+        ratio = part_of_field * before.timing.frame_time_s / frame_s
     return Measure(key, shift, both @ joint @ both.T, ratio, term_s2, scan_s)
 
 
@@ -140,7 +144,7 @@ def clone_keyframe(
     else:
         shift = np.append(measure.shift - bend, np.zeros(2))
         full[2:, 2:] = state.drift_covariance[2:, 2:]
-    return CloneKeyframe(key, measure.key, shift, measure.time_ratio, full, measure.zoom)
+    return CloneKeyframe(key, measure.key, shift, measure.shear_ratio, full, measure.zoom)
 
 
 def measure_itself(key: int, measure: Measure, removed: Array) -> Measure:
@@ -148,4 +152,4 @@ def measure_itself(key: int, measure: Measure, removed: Array) -> Measure:
     noise.
     """
     shift = np.append(measure.acceleration_term_s2 * removed[2:], removed[:2])[: measure.shift.size]
-    return replace(measure, key=key, shift=shift, time_ratio=1.0, zoom=np.zeros((2, 2)))
+    return replace(measure, key=key, shift=shift, shear_ratio=1.0, zoom=np.zeros((2, 2)))

@@ -159,8 +159,9 @@ class CloneKeyframe(Operation):
         Numbers of the keyframes.
     shift
         (4,) what was measured: the shift, and the shear over the frame time.
-    time_ratio
-        Frame time of the parent over that of the frame.
+    shear_ratio
+        What the frame shows of a velocity that is left in the parent's shear: the frame time of the parent over that of
+        the frame, times the height of the frame's field over that of the parent's.
     noise
         (4, 4) added to the covariance.
     zoom
@@ -170,7 +171,7 @@ class CloneKeyframe(Operation):
     key: int
     parent: int
     shift: Array
-    time_ratio: float
+    shear_ratio: float
     noise: Array
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
@@ -185,7 +186,7 @@ class CloneKeyframe(Operation):
         size = state.mean.size
         matrix = np.vstack([np.eye(size), np.zeros((KEYFRAME_SIZE, size))])
         keyframe = state.keyframe_slice(self.parent)
-        matrix[size:, keyframe] = np.diag([1.0, 1.0, self.time_ratio, self.time_ratio])
+        matrix[size:, keyframe] = np.diag([1.0, 1.0, self.shear_ratio, self.shear_ratio])
         matrix[size : size + 2, MOTION_SIZE:BASE_SIZE] = self.zoom
         covariance = np.zeros((size + KEYFRAME_SIZE, size + KEYFRAME_SIZE))
         covariance[size:, size:] = self.noise
@@ -270,8 +271,9 @@ class Measure:
         times the acceleration to the shift.
     covariance
         Covariance of ``shift`` from the noise of the frame alone.
-    time_ratio
-        Frame time of the keyframe over that of the frame.
+    shear_ratio
+        What the frame shows of a velocity that is left in the keyframe's shear: the frame time of the keyframe over
+        that of the frame, times the height of the frame's field over that of the keyframe's.
     acceleration_term_s2
         b of :mod:`semcal_ros.core.drift.state`.
     scan_s
@@ -288,7 +290,7 @@ class Measure:
     key: int
     shift: Array
     covariance: Array
-    time_ratio: float = 1.0
+    shear_ratio: float = 1.0
     acceleration_term_s2: float = 0.0
     scan_s: float = 0.0
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
@@ -324,7 +326,7 @@ class Measure:
         jacobian[:, :count] = np.eye(count)
         jacobian[:2, 4:6] = self.acceleration_term_s2 * np.eye(2)
         jacobian[:2, MOTION_SIZE:BASE_SIZE] = -self.zoom
-        factors = [1.0, 1.0, self.time_ratio, self.time_ratio]
+        factors = [1.0, 1.0, self.shear_ratio, self.shear_ratio]
         jacobian[:, start : start + count] = -np.diag(factors[:count])
         return jacobian
 

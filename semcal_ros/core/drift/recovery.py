@@ -23,7 +23,12 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.estimates import DriftStatus, DriftUpdate
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.gating import OutlierTest, inflate_if_contradicted, inflate_when_lost
+from semcal_ros.core.drift.gating import (
+    OutlierTest,
+    inflate_if_contradicted,
+    inflate_position,
+    inflate_when_lost,
+)
 from semcal_ros.core.drift.matching import RejectedMatch
 from semcal_ros.core.drift.measurement import is_removable
 from semcal_ros.core.drift.new_keyframes import add_keyframe, prepare_keyframe
@@ -36,6 +41,8 @@ from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
 
 # What an image looks like that shows another place: the prediction need not hold.
 _ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
+# It matches a keyframe, at an unexpected place: the next one tells whether that holds.
+_SEEN_AWAY = frozenset({MatchFailure.OUTLIER, MatchFailure.STAGE_MOVE})
 
 
 def coast(
@@ -78,8 +85,12 @@ def coast(
         contradicted = inflate_if_contradicted(drift, state.keyframes.current, nearest, since_s)
         if contradicted is not None:
             state = state.inflate(contradicted)
-    if is_lost or (rescaled and is_of_keyframe):
+    if is_lost:
         return restart(setup, state, frame, rejection)
+    if rescaled and is_of_keyframe and rejection.status not in _SEEN_AWAY:
+        # What is in doubt now is so for all frames that are registered against this one.
+        state = state.inflate(inflate_position(state.doubt))
+        return restart(setup, replace(state, doubt=np.zeros((2, 2))), frame, rejection)
     return state, make_update(
         state, frame, DriftStatus.COASTING, rejection, registration=registration
     )

@@ -19,13 +19,14 @@ The keyframes are landmarks, as in simultaneous localisation and mapping (Smith,
 acceleration a, and for each keyframe j the drift m_j at which it seems to have been taken and the
 velocity w_j by which it still is sheared. A frame that is registered against keyframe j has
 
-    shift = p + a b - m_j - Z e + n,        shear = T v - T_j w_j + n'
+    shift = p + a b - m_j - Z e + n,        shear = T v - (H / H_j) T_j w_j + n'
 
-with noises n and n', the frame times T, and b = A^2 / 24 for an acquisition that takes A: the mean
-of an accelerated drift over the frame is a b away from the drift at its middle. A zoom is about the
-principal point, of which the calibration may have an error e (px) that is the same at all
-magnifications. With Z = J^-1 - J_j^-1 (m per px) it looks like a drift when frame and keyframe have
-different magnifications, and in no other case.
+with noises n and n', the frame times T, the heights H of the fields, of which a zoom shows a part,
+and b = A^2 / 24 for an acquisition that takes A: the mean of an accelerated drift over the frame is
+a b away from the drift at its middle. A zoom is about the principal point, of which the calibration
+may have an error e (in half widths w of the raster) that is the same at all magnifications. With
+Z = J^-1 w - J_j^-1 w_j (m) it looks like a drift when frame and keyframe have different
+magnifications, and in no other case.
 
 All of this is linear, so that one Kalman filter holds it, with every correlation. The noise of a
 keyframe is shared by all frames that were registered against it and does not average out; coming
@@ -125,7 +126,7 @@ class DriftState:
 def initial_state(time_s: float, centre_covariance: Array | None = None) -> DriftState:
     """State at the first frame: zero drift, by definition, and no velocity yet.
 
-    ``centre_covariance`` (2, 2) is that of the principal point, px^2; None where that is exact.
+    ``centre_covariance`` (2, 2) is that of the principal point, in half widths of the raster; None where that is exact.
     """
     covariance = np.zeros((BASE_SIZE, BASE_SIZE))
     if centre_covariance is not None:

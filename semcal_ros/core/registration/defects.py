@@ -68,6 +68,7 @@ from semcal_ros.core.registration.thresholds import (
     SAME_SHIFT_PX,
 )
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
+from semcal_ros.core.wording import counted
 
 
 @dataclass(frozen=True)
@@ -266,8 +267,9 @@ def _find_rival(
     (x, y), (a, b) = best.shift_px.tolist(), rival.shift_px.tolist()
     shifts = f"({x:.1f}, {y:.1f}) and ({a:.1f}, {b:.1f})"
     reason = start + f"whose defects do not tell shifts {shifts} px apart"
-    if DEFECT_EVIDENCE_MAX * left >= EVIDENCE_MIN:
-        reason += f", and {left} defects lie elsewhere"
+    against = DEFECT_EVIDENCE_MAX * left
+    if against >= EVIDENCE_MIN or against > _weigh(best, rival)[0]:
+        reason += f", and {counted(left, 'defect')} elsewhere"
         return Rejection(MatchFailure.DISSIMILAR, reason)
     return Rejection(MatchFailure.AMBIGUOUS, reason)
 

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -132,6 +133,50 @@ def test_drift_is_continuous_through_a_zoom() -> None:
     # frame is known to a hundredth of a px.
     assert np.all(np.abs(np.diff(error, axis=0)) < 4.0 * sigma[1:])
     assert float(np.max(sigma[3:])) < 5e-9
+
+
+def test_drift_is_right_while_every_frame_zooms() -> None:
+    """What is left of the shear of a keyframe is over its field, of which the next frame shows a part."""
+    timing = ScanTiming(0.4, 1, 0.1)
+    # A pixel and more from frame to frame.
+    drift = Drift(velocity_m_s=(700e-9, -400e-9))
+    tracker = DriftTracker()
+    zero = drift(np.array([timing.centre_offset_s]))[0]
+    scores = []
+    for k in range(9):
+        image, camera = frame_of(1000.0 * 1.12**k, timing, drift, 0.5 * k, k)
+        covariance = np.zeros((10, 10))
+        # The calibration knows the centre of the zoom to 5 px.
+        covariance[[3, 4], [3, 4]] = 25.0
+        camera = replace(camera, covariance=covariance)
+        update = tracker.update(image, 0.5 * k, camera, timing)
+        truth = drift(np.array([0.5 * k + timing.centre_offset_s]))[0] - zero
+        error = (update.drift_m - truth) * camera.m
+        scores.append(error / np.maximum(np.sqrt(np.diag(update.covariance)[:2]) * camera.m, 0.01))
+    assert np.max(np.abs(scores)) < 4.0
+
+
+@pytest.mark.parametrize("ratio", [1.02, 1.5])
+def test_a_specimen_that_moves_at_a_zoom_is_found_by_the_next_frame(ratio: float) -> None:
+    """Microscopes do shift the image where they change the magnification."""
+    timing = ScanTiming(0.4, 1, 0.1)
+    drift = Drift(velocity_m_s=(200e-9, -100e-9))
+    # At once, before the frame.
+    after = replace(drift, settling_m=(3e-6, -2e-6), settling_time_s=1e-9)
+    tracker = DriftTracker()
+    zero = drift(np.array([timing.centre_offset_s]))[0]
+    for k in range(9):
+        moved, own = k >= 5, after if k >= 5 else drift
+        image, camera = frame_of(1000.0 * (ratio if moved else 1.0), timing, own, 0.5 * k, k)
+        camera = replace(camera, covariance=np.diag([0.0] * 3 + [25.0] * 2 + [0.0] * 5))
+        update = tracker.update(image, 0.5 * k, camera, timing)
+        error = update.drift_m - (own(np.array([0.5 * k + timing.centre_offset_s]))[0] - zero)
+        sigma = np.sqrt(np.diag(update.covariance)[:2])
+        assert np.all(np.abs(error) < 4.0 * np.maximum(sigma, 0.01 / camera.m)), (
+            k,
+            error * camera.m,
+        )
+        assert update.accepted == (k != 5)
 
 
 @pytest.mark.slow

@@ -487,18 +487,27 @@ def test_a_zoom_about_a_wrong_principal_point_is_an_apparent_step() -> None:
             pixel = axis + jacobian @ specimen
             seen.append(np.linalg.solve(jacobian, pixel - (axis + error)))
         step = seen[1] - seen[0]
-        np.testing.assert_allclose(step, -apparent_zoom_shift(before, after) @ error, rtol=1e-9)
+        share = np.array(error) / before.norm_px
+        np.testing.assert_allclose(step, -apparent_zoom_shift(before, after) @ share, rtol=1e-9)
     # There and back is no step, nor is one without a change of magnification.
     np.testing.assert_allclose(
         apparent_zoom_shift(after, before), -apparent_zoom_shift(before, after)
     )
     np.testing.assert_array_equal(apparent_zoom_shift(before, before), 0.0)
+    # As far, in another number of pixels.
+    finer = after.resized(2 * after.width, 2 * after.height)
+    expected = apparent_zoom_shift(before, after)
+    np.testing.assert_allclose(apparent_zoom_shift(before, finer), expected)
+    np.testing.assert_allclose(
+        apparent_zoom_shift(after, finer), 0.0, atol=1e-9 * np.abs(expected).max()
+    )
 
 
 def test_the_principal_point_is_as_uncertain_as_its_camera_says() -> None:
     camera = uncertain(small_camera(2000.0))
     assert camera.covariance is not None
-    np.testing.assert_array_equal(centre_covariance(camera), camera.covariance[3:5, 3:5])
+    expected = camera.covariance[3:5, 3:5] / camera.norm_px**2
+    np.testing.assert_array_equal(centre_covariance(camera), expected)
     for exact in (None, small_camera(2000.0)):
         np.testing.assert_array_equal(centre_covariance(exact), 0.0)
     # It is none of the errors of the two scales.

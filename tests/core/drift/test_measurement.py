@@ -85,4 +85,19 @@ def test_what_was_removed_from_the_frame_is_added_again() -> None:
     term = PASS_S**2 / 24.0
     expected = [1.0 + 0.06 * term, 2.0 + 0.12 * term, 0.15 + 0.5, -0.05 - 0.25]
     np.testing.assert_allclose(measure.shift, expected)
-    assert measure.time_ratio == pytest.approx(1.5)
+    assert measure.shear_ratio == pytest.approx(1.5)
+
+
+def test_a_frame_shows_the_part_of_a_keyframes_shear_that_is_in_its_field() -> None:
+    wide, narrow = (frame(ScanCamera.nominal(g, 100, 100, 0.1)) for g in (1000.0, 1250.0))
+    measured = registration((0.0, 0.0))
+    measure = make_measurement(5, wide, narrow, measured, np.zeros(4), np.inf)
+    assert measure.shear_ratio == pytest.approx(0.8)
+    # In more pixels it is the same field.
+    fine = ScanFrame(
+        np.zeros((200, 200), np.uint8),
+        ScanCamera.nominal(1000.0, 200, 200, 0.1),
+        ScanTiming(PASS_S),
+    )
+    measure = make_measurement(5, wide, fine, measured, np.zeros(4), np.inf)
+    assert measure.shear_ratio == pytest.approx(1.0)

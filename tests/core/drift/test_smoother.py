@@ -117,7 +117,7 @@ class Dense:
             own = self.noise(event.noise + self.process_noise.frame_covariance(event.scan_s))
             self.places[event.key] = self.sum(where, self.constant(gone), own)
         elif isinstance(event, CloneKeyframe):
-            ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
+            ratio = np.array([1.0, 1.0, event.shear_ratio, event.shear_ratio])
             copy = ratio[:, None] * self.places[event.parent]
             zoomed = np.vstack([event.zoom, np.zeros((2, 2))]) @ self.centre
             own = self.noise(event.noise)
@@ -128,7 +128,7 @@ class Dense:
         elif isinstance(event, Marginalise):
             del self.places[event.key]
         elif isinstance(event, Measure):
-            ratio = np.array([1.0, 1.0, event.time_ratio, event.time_ratio])
+            ratio = np.array([1.0, 1.0, event.shear_ratio, event.shear_ratio])
             where = np.vstack([drift + event.acceleration_term_s2 * turn, pace])
             zoomed = np.vstack([-event.zoom, np.zeros((2, 2))]) @ self.centre
             expected = self.sum(where, zoomed, -ratio[:, None] * self.places[event.key])
