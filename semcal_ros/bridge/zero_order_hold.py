@@ -27,7 +27,7 @@ T = TypeVar("T")
 _NS_PER_S = 1_000_000_000  # nanoseconds per second
 # Fraction of the acquisition at either end in which a change is harmless: a row or two at most.
 _MARGIN = 0.01
-# A magnification published at most this long before a frame was announced together with it.
+# A value published at most this long before a frame, or this part of its scan, was announced together with it.
 _TOGETHER_NS, _TOGETHER_AT_MOST = 20_000_000, 0.25
 # A frame that was published later than this after its scan has a stamp of another clock.
 _LONGEST_WAY_NS = 10 * _NS_PER_S
@@ -117,8 +117,8 @@ def scan_interval_ns(
 ) -> tuple[int, int] | None:
     """Return the first and the last moment of a frame's scan at which a change of magnification spoils it.
 
-    The very first and last rows do not count. Where publication times decide, neither do the last
-    20 ms (at most a quarter of the scan): many drivers announce a magnification with its frame.
+    The very first and last rows do not count. Where publication times decide, neither do the last 20 ms before that of
+    the frame (at most a quarter of its scan): many drivers announce a magnification with its frame.
 
     Parameters
     ----------
@@ -145,11 +145,34 @@ def scan_interval_ns(
             end_ns = sent_ns
         # A frame that is published while it is still being scanned holds what came before.
         end_ns = min(end_ns, sent_ns)
-    long_ns = end_ns - start_ns
-    margin_ns = round(_MARGIN * long_ns)
-    before_ns = margin_ns
+    margin_ns = round(_MARGIN * (end_ns - start_ns))
+    first_ns, last_ns = start_ns + margin_ns, end_ns - margin_ns
     if sent_ns is not None:
-        before_ns = max(margin_ns, min(_TOGETHER_NS, round(_TOGETHER_AT_MOST * long_ns)))
-    if long_ns <= margin_ns + before_ns:
-        return None
-    return start_ns + margin_ns, end_ns - before_ns
+        last_ns = min(last_ns, sent_ns - _together_ns(config))
+    return (first_ns, last_ns) if first_ns < last_ns else None
+
+
+def _together_ns(config: MicroscopeConfig) -> int:
+    """How long before the publication of a frame a value is announced together with it."""
+    if config.scan is None:
+        return _TOGETHER_NS
+    return min(_TOGETHER_NS, round(_TOGETHER_AT_MOST * config.scan.acquisition_time_s * 1e9))
+
+
+def find_values(
+    hold: ZeroOrderHold[T], stamp_ns: int, sent_ns: int | None, config: MicroscopeConfig
+) -> tuple[T | None, list[T | None]]:
+    """Return the value that is that of a frame, and all that were valid during its scan, the one at its start first.
+
+    It is the one in force during the scan, and not at the stamp or the publication, which may come before or after a
+    change; but one that was announced together with the frame. The parameters are those of :func:`scan_interval_ns`;
+    where that is unknown, the value at the stamp or at the publication is all.
+    """
+    interval = scan_interval_ns(stamp_ns, sent_ns, config)
+    if interval is None:
+        value = hold.at(stamp_ns if sent_ns is None else sent_ns)
+        return value, [value]
+    during = [hold.at(interval[0]), *hold.between(*interval)]
+    if sent_ns is not None and hold.between(sent_ns - _together_ns(config), sent_ns):
+        return hold.at(sent_ns), during
+    return during[-1], during

@@ -38,7 +38,7 @@ from semcal_ros.bridge.conditions import (
 from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
 from semcal_ros.bridge.stage import doubt_unit, missing_joints, read_stage, tilt_jump_rad
-from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, find_values, scan_interval_ns
 from semcal_ros.config.config import MicroscopeConfig, StageConfig
 from semcal_ros.core.calibration.stage import StageReading
 from semcal_ros.core.camera.conditions import FILE_NAMES
@@ -128,6 +128,7 @@ class MagnificationTrack(HeldValues[MagnificationReading]):
 
     def __init__(self, reader: BagReader, topic: str, config: MicroscopeConfig) -> None:
         super().__init__(reader, topic, lambda message: read_magnification(message, config))
+        self._config = config
 
     def at(self, stamp_ns: int, log_time_ns: int, image_width_px: int) -> float | None:
         """Return the magnification at an image, or None before the first message and after a bad one.
@@ -137,7 +138,8 @@ class MagnificationTrack(HeldValues[MagnificationReading]):
         MessageError
             A pixel size gives no credible magnification for an image of this width.
         """
-        reading = self.held_at(stamp_ns, log_time_ns)
+        sent_ns = None if self.by_stamp else log_time_ns
+        reading, _ = find_values(self._hold, stamp_ns, sent_ns, self._config)
         return None if reading is None else float(reading.magnification(image_width_px))
 
 

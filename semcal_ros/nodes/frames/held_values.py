@@ -27,11 +27,12 @@ from rclpy.callback_groups import CallbackGroup
 from semcal_ros.bridge.conditions import read_conditions
 from semcal_ros.bridge.fields import optional_stamp_ns
 from semcal_ros.bridge.magnification import MagnificationReading, read_magnification
-from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, find_values
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.camera.conditions import compare_conditions
 from semcal_ros.core.camera.records import NOT_RECORDED
+from semcal_ros.core.drift.thresholds import SAME_SCALE
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.context import NodeContext
@@ -100,6 +101,8 @@ class MagnificationInput:
         self._renewals = 0
         self._last_ns = 0
         self._latest_sent_ns = 0
+        # The history up to a stamp, after which the clock went back.
+        self._aside: tuple[int, ZeroOrderHold[MagnificationReading | None]] | None = None
         # Until when, on a steady clock, to wait for a message that was published after the other time.
         self._doubted: tuple[float, int] | None = None
 
@@ -150,7 +153,7 @@ class MagnificationInput:
         self._subscription.take_waiting()
         if self._has_stamp:
             self._forget_if_back(stamp_ns)
-        reading = self._history.at(stamp_ns if self._has_stamp else sent_ns)
+        reading, _ = self._find(stamp_ns, sent_ns)
         if reading is None or self._is_doubted():
             return None
         return replace(reading, config=config).magnification(image_width_px)
@@ -179,24 +182,41 @@ class MagnificationInput:
         return self._doubted is not None
 
     def _forget_if_back(self, stamp_ns: int) -> None:
-        """Forget the history if the clock went back and no magnification has arrived since."""
+        """Set the history aside if the clock went back and no magnification has arrived since.
+
+        It is taken up again where the next stamps go on as if nothing had been: a single frame may have a bad stamp.
+        """
         newest_ns = self._history.newest_ns
         went_back = stamp_ns < self._last_ns - _CLOCK_STEP_NS
         if went_back and newest_ns is not None and newest_ns > stamp_ns + _CLOCK_STEP_NS:
-            self._history.clear()
+            self._aside = self._last_ns, self._history
+            self._history = ZeroOrderHold(_KEPT)
+            self._subscription.ask_again()
+        elif self._aside is not None:
+            last_ns, history = self._aside
+            if len(self._history):
+                self._aside = None
+            elif stamp_ns >= last_ns - _CLOCK_STEP_NS:
+                self._aside, self._history = None, history
         self._last_ns = stamp_ns
+
+    def _find(
+        self, stamp_ns: int, sent_ns: int
+    ) -> tuple[MagnificationReading | None, list[MagnificationReading | None]]:
+        return find_values(
+            self._history, stamp_ns, None if self._has_stamp else sent_ns, self._config
+        )
 
     def changed_during(self, stamp_ns: int, sent_ns: int) -> bool:
         """Return whether the magnification changed during a frame's scan, as far as that is known.
 
         Call it after :meth:`at`, with the same arguments.
         """
-        sent = None if self._has_stamp else sent_ns
-        interval = scan_interval_ns(stamp_ns, sent, self._config)
-        if interval is None:
-            return False
-        values = [self._history.at(interval[0]), *self._history.between(*interval)]
-        return len({None if value is None else value.value for value in values}) > 1
+        _, during = self._find(stamp_ns, sent_ns)
+        values = [reading.value for reading in during if reading is not None]
+        if len(values) < len(during):
+            return len(during) > 1
+        return max(values) > SAME_SCALE * min(values)
 
 
 class ConditionsInput:

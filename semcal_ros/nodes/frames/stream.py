@@ -62,6 +62,8 @@ _CHECK_S, _CHECKED_PIXELS = 0.5, 1 << 14
 _DARKEST = {1: 2, 2: 8}
 # Images per turn of the executor; then timers and services get their turn.
 _AT_ONCE = 8
+# While a person zooms, some frames in a row are.
+_MANY_MIXED = 10
 
 _MIXED = ParameterDeclaration(
     "mixed_frames",
@@ -257,6 +259,7 @@ class FrameInput:
         self._sent_ns: int | None = None
         self._last_interval_s = 0.0
         self._mixed = 0
+        self._mixed_in_a_row = 0
         self._dark = ""
         self._checked_s = -_CHECK_S
 
@@ -331,6 +334,12 @@ class FrameInput:
         g = self._magnification.at(stamp_ns, sent_ns, image.shape[1], self._magnification_config())
         mixed = self._magnification.changed_during(stamp_ns, sent_ns)
         self._mixed += mixed
+        self._mixed_in_a_row = self._mixed_in_a_row + 1 if mixed else 0
+        if self._mixed_in_a_row >= _MANY_MIXED:
+            self._reporter.warn_seldom(
+                "every frame was scanned while the magnification changed (frames_mixed); see mixed_frames, and"
+                " whether image.stamp and scan in the configuration hold"
+            )
         self._reporter.note("magnification", "unknown" if g is None else g)
         self._reporter.note("frames_mixed", self._mixed)
         image = self._without_line_phase(image)

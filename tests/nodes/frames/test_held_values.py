@@ -12,20 +12,28 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Conditions that are not those of the calibration are said once per change; bad messages are not known conditions."""
+"""Magnifications are those of the frames, whatever single stamps say.
+
+Conditions that are not those of the calibration are said once per change; bad messages are not known conditions.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.time import Time
 
+from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.records import Provenance
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.nodes.frames.calibrated_stream import CalibratedStreamNode
-from semcal_ros.nodes.frames.held_values import ConditionsWatch
+from semcal_ros.nodes.frames.held_values import ConditionsWatch, MagnificationInput
 from tests.helpers.node_fakes import FakeEndpoints, fake_context, fake_reporter, notes
 from tests.helpers.node_scenes import make_calibration
 
@@ -38,6 +46,69 @@ MADE_AT = Provenance(
 )
 CALIBRATION = replace(make_calibration(), provenance=MADE_AT)
 SAME = {"accelerating_voltage_v": "5000.0", "detector": "SE2", "working_distance_m": "0.01"}
+
+
+STAMPED = """name: sem
+display_width_m: 0.12
+magnification: {quantity: magnification, type: geometry_msgs/msg/Vector3Stamped, field: vector.x}
+"""
+S = 1_000_000_000
+
+
+class StampedMagnification:
+    """The input of stamped magnifications, and frames that ask it."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        path = tmp_path / "sem.yaml"
+        path.write_text(STAMPED)
+        self.config = load_config(str(path))
+        endpoints: Any = FakeEndpoints()
+        self.input = MagnificationInput(fake_context(endpoints, self.config))
+        self.subscription = endpoints.subscriptions["magnification"]
+
+    def tell(self, stamp_s: float, value: float) -> None:
+        message = Vector3Stamped()
+        message.header.stamp = Time(nanoseconds=round(stamp_s * S)).to_msg()
+        message.vector.x = value
+        self.subscription.callback(message, {"source_timestamp": 0, "received_timestamp": 0})
+
+    def at(self, stamp_s: float) -> float | None:
+        return self.input.at(round(stamp_s * S), 0, 512, self.config)
+
+    def is_mixed(self, stamp_s: float) -> bool:
+        return self.input.changed_during(round(stamp_s * S), 0)
+
+
+@pytest.mark.parametrize("bad_s", [0.0, 1000.0])
+def test_one_bad_stamp_does_not_make_the_magnification_unknown_for_good(
+    tmp_path: Path, bad_s: float
+) -> None:
+    stream = StampedMagnification(tmp_path)
+    stream.tell(5000.0, 800.0)
+    assert stream.at(5001.0) == 800.0
+    assert stream.at(bad_s) is None
+    # Publishers are asked for their latest value, should the clock have gone back.
+    assert stream.subscription.asked_again == 1
+    assert stream.at(5002.0) == 800.0
+
+
+def test_after_the_clock_went_back_only_new_values_count(tmp_path: Path) -> None:
+    stream = StampedMagnification(tmp_path)
+    stream.tell(5000.0, 800.0)
+    assert stream.at(5001.0) == 800.0
+    assert stream.at(100.0) is None
+    stream.tell(99.0, 300.0)
+    assert [stream.at(101.0), stream.at(5002.0)] == [300.0, 300.0]
+
+
+def test_what_only_trembles_is_no_change(tmp_path: Path) -> None:
+    stream = StampedMagnification(tmp_path)
+    stream.input._config = replace(stream.config, scan=ScanTiming(1.0))
+    for k in range(20):
+        stream.tell(10.0 + 0.1 * k, 800.0 * (1.0 + 1e-9 * k))
+    assert not stream.is_mixed(10.5)
+    stream.tell(12.0, 801.0)
+    assert stream.is_mixed(11.5)
 
 
 class Bench:

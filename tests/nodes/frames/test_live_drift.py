@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, scan_interval_ns
+from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, find_values, scan_interval_ns
 from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.common.parameters import INTERPOLATION
@@ -192,11 +192,49 @@ def test_with_stamps_the_scan_is_where_the_stamp_says(stamp: str, start_ms: int)
 
 def test_with_publication_times_the_last_moments_belong_to_the_frame() -> None:
     # Published when it is complete: a magnification 20 ms before is announced with it.
-    assert scan_interval_ns(0, 1010 * MS, config()) == (10 * MS, 980 * MS)
+    assert scan_interval_ns(0, 1000 * MS, config()) == (10 * MS, 980 * MS)
+    # Published later: one that came during the last 20 ms of the scan is none of these.
+    assert scan_interval_ns(0, 1100 * MS, config()) == (10 * MS, 990 * MS)
     # Published before it can be complete.
     assert scan_interval_ns(0, 500 * MS, config()) == (5 * MS, 480 * MS)
     # Without raster timing it was scanned between its stamp and its publication.
     assert scan_interval_ns(0, 200 * MS, config(scan="")) == (2 * MS, 180 * MS)
+    # What is published as soon as it is grabbed may come right after its magnification.
+    assert scan_interval_ns(0, 20 * MS, config(scan="")) is None
+
+
+@pytest.mark.parametrize(
+    ("changed_ms", "found", "during"),
+    [
+        (5, 2.0, [2.0]),  # in the first rows
+        (500, 2.0, [1.0, 2.0]),  # mixed
+        (985, 2.0, [1.0, 2.0]),
+        (995, 1.0, [1.0]),  # in the last rows
+        (1050, 1.0, [1.0]),  # after the scan, and before the frame was published
+        (1095, 2.0, [1.0]),  # announced together with it
+        (1150, 1.0, [1.0]),
+    ],
+)
+def test_the_value_of_a_frame_is_the_one_during_its_scan(
+    changed_ms: int, found: float, during: list[float]
+) -> None:
+    hold = ZeroOrderHold[float]()
+    hold.insert(-1000 * MS, 1.0)
+    hold.insert(changed_ms * MS, 2.0)
+    assert find_values(hold, 0, 1100 * MS, config()) == (found, during)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "changed_ms", "found"),
+    [("start", 5, 2.0), ("start", 995, 1.0), ("end", -995, 2.0), ("end", -5, 1.0)],
+)
+def test_a_stamped_value_is_the_one_during_the_scan_wherever_the_frame_is_stamped(
+    stamp: str, changed_ms: int, found: float
+) -> None:
+    hold = ZeroOrderHold[float]()
+    hold.insert(-5000 * MS, 1.0)
+    hold.insert(changed_ms * MS, 2.0)
+    assert find_values(hold, 0, None, config(stamp)) == (found, [found])
 
 
 def test_nothing_is_known_of_a_stamp_of_another_clock() -> None:
