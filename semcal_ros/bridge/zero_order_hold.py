@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from typing import Generic, TypeVar
 
@@ -29,6 +30,8 @@ _NS_PER_S = 1_000_000_000  # nanoseconds per second
 _MARGIN = 0.01
 # A value published at most this long before a frame, or this part of its scan, was announced together with it.
 _TOGETHER_NS, _TOGETHER_AT_MOST = 20_000_000, 0.25
+# Part of a recursive average below which what an earlier pass shows is harmless.
+_OLD_SHARE = 0.05
 # A frame that was published later than this after its scan has a stamp of another clock.
 _LONGEST_WAY_NS = 10 * _NS_PER_S
 
@@ -117,7 +120,8 @@ def scan_interval_ns(
 ) -> tuple[int, int] | None:
     """Return the first and the last moment of a frame's scan at which a change of magnification spoils it.
 
-    The very first and last rows do not count. Where publication times decide, neither do the last 20 ms before that of
+    The very first and last rows do not count, and of a recursive average the earlier passes do, as long as they make up
+    a twentieth of it. Where publication times decide, neither do the last 20 ms before that of
     the frame (at most a quarter of its scan): many drivers announce a magnification with its frame.
 
     Parameters
@@ -146,10 +150,18 @@ def scan_interval_ns(
         # A frame that is published while it is still being scanned holds what came before.
         end_ns = min(end_ns, sent_ns)
     margin_ns = round(_MARGIN * (end_ns - start_ns))
-    first_ns, last_ns = start_ns + margin_ns, end_ns - margin_ns
+    first_ns, last_ns = start_ns + margin_ns - _blended_ns(config), end_ns - margin_ns
     if sent_ns is not None:
         last_ns = min(last_ns, sent_ns - _together_ns(config))
     return (first_ns, last_ns) if first_ns < last_ns else None
+
+
+def _blended_ns(config: MicroscopeConfig) -> int:
+    """How long before its latest pass a recursive average still shows what there was."""
+    if config.scan is None or config.scan.recursive_averages == 1:
+        return 0
+    kept = 1.0 - 1.0 / config.scan.recursive_averages
+    return round(math.log(_OLD_SHARE) / math.log(kept) * config.scan.frame_time_s * 1e9)
 
 
 def _together_ns(config: MicroscopeConfig) -> int:

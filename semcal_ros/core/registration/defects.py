@@ -68,7 +68,6 @@ from semcal_ros.core.registration.thresholds import (
     SAME_SHIFT_PX,
 )
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
-from semcal_ros.core.wording import counted
 
 
 @dataclass(frozen=True)
@@ -269,7 +268,7 @@ def _find_rival(
     reason = start + f"whose defects do not tell shifts {shifts} px apart"
     against = DEFECT_EVIDENCE_MAX * left
     if against >= EVIDENCE_MIN or against > _weigh(best, rival)[0]:
-        reason += f", and {counted(left, 'defect')} elsewhere"
+        reason += f", and with {left} of them elsewhere"
         return Rejection(MatchFailure.DISSIMILAR, reason)
     return Rejection(MatchFailure.AMBIGUOUS, reason)
 

@@ -27,6 +27,7 @@ import pytest
 
 from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, find_values, scan_interval_ns
 from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.frames.compressed import compressed_parameters
@@ -235,6 +236,15 @@ def test_a_stamped_value_is_the_one_during_the_scan_wherever_the_frame_is_stampe
     hold.insert(-5000 * MS, 1.0)
     hold.insert(changed_ms * MS, 2.0)
     assert find_values(hold, 0, None, config(stamp)) == (found, [found])
+
+
+def test_a_recursive_average_shows_earlier_passes() -> None:
+    averaging = replace(config(), scan=ScanTiming(0.25, recursive_averages=4))
+    interval = scan_interval_ns(0, None, averaging)
+    assert interval is not None
+    # After eleven passes, 0.75^11 = 0.042 of what was before is left.
+    assert -11 * 250 * MS < interval[0] < -10 * 250 * MS
+    assert interval[1] == 247.5 * MS
 
 
 def test_nothing_is_known_of_a_stamp_of_another_clock() -> None:
