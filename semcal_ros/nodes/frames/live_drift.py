@@ -186,7 +186,9 @@ class LiveDrift:
             self._load.add_interval(frame.interval_s)
         time_s, centre_s = self._times(frame)
         if self._latest is not None and centre_s < self._latest.predictor.time_s:
-            self._reporter.info("the stamps of the images went back: the drift begins at zero again")
+            self._reporter.info(
+                "the stamps of the images went back: the drift begins at zero again"
+            )
             self.reset()
             time_s, centre_s = self._times(frame)
         waits = self._waits or self._is_far(centre_s)
