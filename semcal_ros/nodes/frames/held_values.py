@@ -215,7 +215,8 @@ class MagnificationInput:
         _, during = self._find(stamp_ns, sent_ns)
         values = [reading.value for reading in during if reading is not None]
         if len(values) < len(during):
-            return len(during) > 1
+            # Known for a part of the scan only.
+            return bool(values)
         return max(values) > SAME_SCALE * min(values)
 
 

@@ -111,6 +111,18 @@ def test_what_only_trembles_is_no_change(tmp_path: Path) -> None:
     assert stream.is_mixed(11.5)
 
 
+def test_a_frame_of_which_nothing_is_known_is_not_mixed(tmp_path: Path) -> None:
+    stream = StampedMagnification(tmp_path)
+    stream.input._config = replace(stream.config, scan=ScanTiming(1.0))
+    for stamp_s in (10.0, 10.5):
+        stream.tell(stamp_s, -1.0)
+    assert stream.at(10.2) is None
+    assert not stream.is_mixed(10.2)
+    # It becomes known in the middle of the scan.
+    stream.tell(11.5, 800.0)
+    assert stream.is_mixed(11.2)
+
+
 class Bench:
     """A watch, and messages for it."""
 
