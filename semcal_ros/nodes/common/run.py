@@ -30,6 +30,7 @@ from typing import Any, TypeVar
 
 import rclpy.utilities
 from rclpy.exceptions import (
+    InvalidHandle,
     InvalidNamespaceException,
     InvalidNodeNameException,
     InvalidParameterTypeException,
@@ -148,7 +149,27 @@ def run_node(
         return _run(lambda: _make(factory), line, lambda node, end: _spin(node, threads, end))
 
 
-class _OneAtATime(SingleThreadedExecutor):
+class _Patient(Executor):
+    """An executor that waits again where something was destroyed by another thread while it began to wait.
+
+    rclpy then raises, before anything was taken: it passes over the event of a subscription that is being destroyed
+    when it enters what it waits for, and adds it all the same. Nodes create and destroy subscriptions in threads of
+    their own, such as that which plays a recording.
+    """
+
+    def wait_for_ready_callbacks(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the next callback as the base class does."""
+        while True:
+            # What was destroyed is not in the next set.
+            with suppress(InvalidHandle):
+                return super().wait_for_ready_callbacks(*args, **kwargs)
+
+
+class _Alone(_Patient, SingleThreadedExecutor):
+    """An executor of one thread."""
+
+
+class _OneAtATime(_Alone):
     """An executor whose callbacks run while it holds a lock.
 
     Parameters
@@ -378,7 +399,7 @@ def _print_help(make: Callable[[], object]) -> int:
     raise AssertionError("a node that starts in spite of --help")
 
 
-class _Threads(MultiThreadedExecutor):
+class _Threads(_Patient, MultiThreadedExecutor):
     """An executor that can be waited for."""
 
     def wait_for_callbacks(self, limit_s: float) -> None:
@@ -389,7 +410,7 @@ class _Threads(MultiThreadedExecutor):
 
 
 def _spin(node: Node, threads: int, end: _EndRequest) -> int:
-    executor = _Threads(num_threads=threads) if threads > 1 else SingleThreadedExecutor()
+    executor = _Threads(num_threads=threads) if threads > 1 else _Alone()
     try:
         executor.add_node(node)
         if isinstance(node, SemNode):
@@ -410,7 +431,7 @@ def _spin(node: Node, threads: int, end: _EndRequest) -> int:
 
 def _spin_together(made: Parts, end: _EndRequest) -> int:
     lead, parts = made.lead, made.others
-    executor = SingleThreadedExecutor()
+    executor = _Alone()
     executor.add_node(lead)
     busy: list[str] = []
     try:

@@ -185,3 +185,72 @@ def test_parts_of_a_process_end_together(how: str, status: int, said: str) -> No
     )
     assert done.returncode == status, done.stderr
     assert said in done.stdout + done.stderr
+
+
+# A node of which a subscription is destroyed at the very moment at which the executor begins to wait for it, as a
+# thread of its own may do: by what the executor enters just before.
+DESTROYS = """
+import sys
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.waitable import NumberOfEntities, Waitable
+from semcal_ros.nodes.common.run import Part, Parts, run_node, run_parts
+from std_msgs.msg import Float64
+
+alone, threads = sys.argv[1] == "alone", int(sys.argv[2])
+
+class Destroying(Waitable):
+    def __init__(self, node):
+        super().__init__(ReentrantCallbackGroup())
+        self._node, self.left = node, []
+
+    def __enter__(self):
+        while self.left:
+            self._node.destroy_subscription(self.left.pop())
+            print("destroyed", flush=True)
+
+    def __exit__(self, *_):
+        pass
+
+    def is_ready(self, wait_set):
+        return False
+
+    def get_num_entities(self):
+        return NumberOfEntities()
+
+    def add_to_wait_set(self, wait_set):
+        pass
+
+class Short(Node):
+    def __init__(self):
+        super().__init__("short")
+        events = SubscriptionEventCallbacks(incompatible_qos=print)
+        # Before the event in the order of the node.
+        waits = Destroying(self)
+        self.add_waitable(waits)
+        waits.left = [self.create_subscription(Float64, "x", print, 1, event_callbacks=events)]
+        self._timer = self.create_timer(0.2, self._end)
+
+    def _end(self):
+        print("ticked", flush=True)
+        raise ExternalShutdownException
+
+def make():
+    return Parts(Node("lead"), [Part(Short())], lambda: False)
+
+arguments = ["--ros-args", "--log-level", "error"]
+sys.exit(run_node(Short, arguments, threads=threads) if alone else run_parts(make, arguments))
+"""
+
+
+@pytest.mark.parametrize(("how", "threads"), [("alone", 1), ("alone", 2), ("part", 1)])
+def test_what_is_destroyed_while_the_executor_begins_to_wait_ends_nothing(
+    how: str, threads: int
+) -> None:
+    command = [sys.executable, "-c", DESTROYS, how, str(threads)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    # With two threads the timer may tick again before the executor sees how the first time ended.
+    assert done.stdout.split()[:2] == ["destroyed", "ticked"], done.stderr
