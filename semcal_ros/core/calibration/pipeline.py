@@ -109,6 +109,11 @@ from semcal_ros.core.errors import (
 )
 from semcal_ros.core.wording import counted
 
+_UNUSED_STAGE = (
+    "the stage is not used; check the unit of its angles, its rotation, its stamps, and the direction of its tilt axis "
+    "(stage.tilt_axis_deg)"
+)
+
 
 def calibrate_views(
     views: Sequence[GridView],
@@ -157,23 +162,52 @@ def calibrate_views(
         fit = fit_separately(setup, options.method, options.method_options)
         _check_converged(setup, fit, factor)
         return judge(setup, fit, options, None, ())
-    joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
-    contradiction = _find_contradicted_stage(views, setup)
-    if contradiction:
-        bare = [replace(view, stage=None) for view in views]
-        if not are_enough(bare, options):
-            raise CalibrationError(
-                f"{counted(len(views), 'view')} that contradict the tilt of the stage",
-                expected=f"tilts that the images agree with, or at least {VIEWS_MIN} views, which need none",
-                do="check the unit of the stage's angles, its stamps and stage.tilt_axis_deg, or record more views",
-            )
+    bare = [replace(view, stage=None) for view in views]
+    is_optional = any(view.has_stage_tilt for view in views) and are_enough(bare, options)
+    failed: CalibrationError | None = None
+    try:
+        joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+        contradiction = _find_contradicted_stage(views, setup)
+        if not contradiction:
+            notes += [*_find_turned_axis(views, setup, joint), *lines]
+            return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
+    except CalibrationError as error:
+        if not is_optional:
+            raise
+        failed = error
+        contradiction = [
+            Finding(f"scale: with the tilts of the stage there is {error.seen}: {_UNUSED_STAGE}")
+        ]
+    if not is_optional:
+        raise CalibrationError(
+            f"{counted(len(views), 'view')} that contradict the tilt of the stage",
+            expected=f"tilts that the images agree with, or at least {VIEWS_MIN} views, which need none",
+            do="check the unit of the stage's angles, its stamps and stage.tilt_axis_deg, or record more views",
+        )
+    try:
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
         joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
-    notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
+        notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
+        return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
+    except CalibrationError as error:
+        # Without the stage it is no better: that was not what is wrong.
+        raise failed or error from None
+
+
+def _conclude(
+    setup: Setup,
+    factor: float,
+    options: CalibrationOptions,
+    joint: JointFit,
+    outliers: tuple[RejectedView, ...],
+    notes: Sequence[Finding],
+    on_stage: Callable[[str, float], None],
+) -> CalibrationResult:
+    """Judge a joint fit; ``notes`` are the findings so far."""
     joint = add_common_tilt(joint)
     fit = describe_fit(setup, joint)
     if options.untilted == "auto":
-        notes += _propose_untilted(setup, joint, fit)
+        notes = [*notes, *_propose_untilted(setup, joint, fit)]
     fit = replace(fit, findings=(*notes, *fit.findings))
     _check_converged(setup, fit, factor)
     on_stage("held-out magnifications", 0.95)
@@ -494,9 +528,7 @@ def _find_contradicted_stage(given: Sequence[GridView], setup: Setup) -> list[Fi
         return []
     return [
         Finding(
-            f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: the stage is not "
-            "used; check the unit of its angles, its rotation, its stamps, and the direction of its tilt axis "
-            "(stage.tilt_axis_deg)"
+            f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: {_UNUSED_STAGE}"
         )
     ]
 

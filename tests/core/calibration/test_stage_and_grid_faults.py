@@ -26,6 +26,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration import pipeline
 from semcal_ros.core.calibration.judgement.findings import find_weaknesses
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
@@ -314,6 +315,31 @@ def test_a_stage_that_most_views_contradict_is_left_out_at_once():
     assert stages.count("start values") <= 3
     plain = calibrated([replace(view, stage=None) for view in views], axis=StageAxis(0.2))
     np.testing.assert_array_equal(result.model.at(1500.0).P, plain.model.at(1500.0).P)
+
+
+@pytest.mark.parametrize("is_cured", [True, False])
+def test_a_fit_that_fails_with_the_stage_is_made_without_it(monkeypatch, is_cured):
+    """As where a scan was turned by 90 degrees for half of the views, and nobody says so."""
+    conclude = pipeline.judge
+
+    def judge(setup, *given):
+        with_stage = any(view.has_stage_tilt for view in setup.views)
+        if with_stage or not is_cured:
+            raise CalibrationError("a fit at no minimum" if with_stage else "another one")
+        return conclude(setup, *given)
+
+    monkeypatch.setattr(pipeline, "judge", judge)
+    views = stage_views(
+        MICROSCOPE.camera_at, (1000.0,), ONE_AXIS, most_corners=60, seed=1, readings=True
+    )
+    if not is_cured:
+        with pytest.raises(CalibrationError, match="a fit at no minimum"):
+            calibrated(views, axis=StageAxis(0.2))
+        return
+    result = calibrated(views, axis=StageAxis(0.2))
+    (note,) = (note for note in scale_notes(result) if "the stage is not used" in note)
+    assert "with the tilts of the stage there is a fit at no minimum" in note
+    assert not any(view.has_stage_tilt for view in result.views)
 
 
 @pytest.mark.slow
