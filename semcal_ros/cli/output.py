@@ -27,17 +27,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from semcal_ros.core.wording import counted, group_by_kind, omit_numbers
+from semcal_ros.core.wording import counted, group_by_kind
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
     from semcal_ros.core.calibration.views import RejectedView
     from semcal_ros.core.camera.calibration_model import CalibrationModel
-
-
-# Rejected views that are named for each kind of reason; the report shows all.
-_MOST_NAMED = 5
 
 
 # Work of less than this, s, needs no bar.
@@ -189,14 +185,10 @@ def echo_json(value: Any) -> None:
 
 def echo_rejected(rejected: Sequence[RejectedView]) -> None:
     """Print each kind of reason once, with the views that have it."""
-    kinds: dict[str, list[RejectedView]] = {}
-    for view in rejected:
-        kinds.setdefault(omit_numbers(view.reason), []).append(view)
-    for views in kinds.values():
-        names = [f"{view.name} at {view.magnification:g}" for view in views[:_MOST_NAMED]]
-        if len(views) > _MOST_NAMED:
-            names.append(f"{len(views) - _MOST_NAMED} more")
-        click.echo(f"rejected: {', '.join(names)}: {views[0].reason}", err=True)
+    from semcal_ros.workflows.find_grid import name_rejected
+
+    for text in name_rejected(rejected):
+        click.echo(f"rejected: {text}", err=True)
 
 
 def list_rejections(rejected: Sequence[RejectedView]) -> list[dict[str, Any]]:

@@ -285,6 +285,8 @@ class CalibrationServer(StreamNode):
     def take_view(self, request: ViewRequest | PictureRequest | None) -> str:
         """Make use of the newest frame, which must show what was asked for."""
         self.refuse_rivals()
+        if request is None and self.frames is not None:
+            self.frames.refuse_unused()
         picture = self._state.now.picture_to_take()
         if request is not None:
             self.acquisition.record(picture)

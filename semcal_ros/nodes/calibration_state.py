@@ -50,7 +50,7 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError, Rejectio
 from semcal_ros.core.ladder.acquisition import PictureRequest
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.core.wording import counted
-from semcal_ros.nodes.acquisition.recorded import RecordedView
+from semcal_ros.nodes.acquisition.recorded import RecordedView, view_name
 from semcal_ros.nodes.workers.calibration_worker import (
     CalibrationJob,
     ExtensionJob,
@@ -249,10 +249,10 @@ class CalibrationState:
 
     def with_view(self, view: FoundView, picture: StreamPicture) -> tuple[CalibrationState, str]:
         """Add a view; also return what it is, in words."""
-        view = replace(view, name=f"view {len(self.views)}")
+        view = replace(view, name=view_name(len(self.views)))
         taken = RecordedView(view, picture.frame.stamp_ns, picture.conditions)
         views = (*self.views, taken)
-        text = f"view {len(views)} at {view.magnification:g}x"
+        text = f"{view.name} at {view.magnification:g}x"
         text += f" with {counted(len(view.detection.xy), 'corner')}"
         tilt = None if view.stage is None else view.stage.tilt_rad
         text += "" if tilt is None else f", tilted by {np.degrees(tilt):.1f} degrees"
@@ -278,7 +278,7 @@ class CalibrationState:
         return len(self.views) - self.calibrated_views
 
     def _named_views(self, stage_doubt: str) -> tuple[FoundView, ...]:
-        views = tuple(replace(one.view, name=f"view {i}") for i, one in enumerate(self.views))
+        views = tuple(replace(one.view, name=view_name(i)) for i, one in enumerate(self.views))
         return tuple(replace(v, stage=None) for v in views) if stage_doubt else views
 
     def _describe(self, config: MicroscopeConfig, views: Iterable[FoundView]) -> Provenance:

@@ -46,7 +46,7 @@ from semcal_ros.core.corners import (
     find_lattice,
 )
 from semcal_ros.core.errors import CalibrationError, Rejection
-from semcal_ros.core.wording import counted
+from semcal_ros.core.wording import counted, omit_numbers
 from semcal_ros.files.recordings import RecordedFrame, Recording
 from semcal_ros.workflows.options import Option
 from semcal_ros.workflows.workers import Workers
@@ -77,6 +77,8 @@ _MUCH_LONGER, _AS_LONG = 3.0, 0.5
 _TOO_FEW_TO_SHARE = 12
 # Reasons that a message about refused views gives.
 _MOST_REASONS = 4
+# Views that are named for each kind of reason; the report shows all.
+_MOST_NAMED = 5
 # Patterns that have their points in the middle of their cells.
 _CELLS = {"dots", "crosses", "lines"}
 # Frames that this process takes itself where a grid can end the search, before it starts others that would not end
@@ -257,6 +259,20 @@ def group_reasons(rejected: Sequence[RejectedView]) -> str:
     ]
     left = len(counts) - len(texts)
     return "; ".join(texts) + (f"; and {counted(left, 'other reason')}" if left > 0 else "")
+
+
+def name_rejected(rejected: Sequence[RejectedView]) -> list[str]:
+    """Say each kind of reason once, with the names and magnifications of the views that have it."""
+    kinds: dict[str, list[RejectedView]] = {}
+    for view in rejected:
+        kinds.setdefault(omit_numbers(view.reason), []).append(view)
+    texts = []
+    for views in kinds.values():
+        names = [f"{view.name} at {view.magnification:g}" for view in views[:_MOST_NAMED]]
+        if len(views) > _MOST_NAMED:
+            names.append(f"{len(views) - _MOST_NAMED} more")
+        texts.append(f"{', '.join(names)}: {views[0].reason}")
+    return texts
 
 
 def collect_views(

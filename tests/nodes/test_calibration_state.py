@@ -162,7 +162,7 @@ def test_a_view_is_described_and_keeps_no_pixels() -> None:
     after, text = state.with_view(picture.to_view(detection(), None), picture)
     assert text == "view 1 at 1000x with 16 corners, tilted by 20.1 degrees"
     view = after.views[0].view
-    assert (view.name, view.stage, view.visit) == ("view 0", TILTED, 0)
+    assert (view.name, view.stage, view.visit) == ("view 1", TILTED, 0)
     assert view.image is not None
     assert view.image.size == 1
     # A state is never changed.
@@ -186,7 +186,7 @@ def test_a_job_has_all_views_and_one_runs_at_a_time() -> None:
         job_of(CalibrationState())
     state = collected(500.0, 1000.0, 1000.0, stage=TILTED)
     job = job_of(state)
-    assert [view.name for view in job.views] == ["view 0", "view 1", "view 2"]
+    assert [view.name for view in job.views] == ["view 1", "view 2", "view 3"]
     assert [view.visit for view in job.views] == [0, 1, 1]
     assert job.views[0].stage == TILTED
     assert job.notes == ()

@@ -35,6 +35,7 @@ from semcal_ros.core.errors import CalibrationError, InvalidValueError, Unusable
 from semcal_ros.files.bags.messages import blank_message
 from semcal_ros.files.bags.writer import BagWriter
 from semcal_ros.files.images.write import PixelScale, write_image
+from semcal_ros.nodes.workers.calibration_worker import CalibrationJob
 from semcal_ros.synthetic import Detector, calibration_plan, preset
 from semcal_ros.workflows import calibrate as workflow
 from semcal_ros.workflows.calibrate import (
@@ -184,6 +185,18 @@ def test_a_view_at_a_wrong_magnification_is_named(found):
     assert "wrong magnification" in reason
     assert wrong.name not in [v.name for v in done.result.views]
     assert len(done.collected.views) == len(done.collected.found) == len(found[0]) - 1
+
+
+@pytest.mark.slow
+def test_a_live_calibration_names_the_views_that_it_leaves_out(found):
+    wrong = found[0][6]
+    views = [replace(v, magnification=1.3 * v.magnification) if v is wrong else v for v in found[0]]
+    job = CalibrationJob(tuple(views), 0.12, tuple(SQUARES), CalibrationOptions())
+    _, summary, notes = job.compute(lambda _name, _fraction: None)
+    assert f"from {len(views) - 1} views of {len(views)}, " in summary
+    (left_out,) = (note for note in notes if note.startswith("left out: "))
+    assert f"{wrong.name} at {1.3 * wrong.magnification:g}: " in left_out
+    assert "wrong magnification" in left_out
 
 
 @pytest.mark.long

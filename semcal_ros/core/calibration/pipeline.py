@@ -346,7 +346,7 @@ def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tupl
     for view in views:
         if (count := len(view.board_xy_m)) < MINIMUM_CORNERS:
             raise CalibrationError(
-                f"view {view.name} with {counted(count, 'corner')}",
+                f"{view.name} with {counted(count, 'corner')}",
                 expected=f"at least {MINIMUM_CORNERS} in every view",
                 do="leave this view out",
             )
@@ -591,7 +591,7 @@ def _find_outlier_of_few(setup: Setup) -> Mapping[int, Rejection[ViewStatus]]:
     first, second = (f"{v.name} (at {v.magnification:g})" for v in setup.views)
     apart_um = 1e6 * float(np.max(np.abs(found.height_m)))
     raise CalibrationError(
-        f"views {first} and {second} that do not agree: their heights would differ by {apart_um:.0f} um",
+        f"{first} and {second} that do not agree: their heights would differ by {apart_um:.0f} um",
         expected="two views of one grid, at magnifications and with squares that are stated rightly",
         do="check the magnifications and the squares of both, or record a third view, which tells which is wrong",
     )
@@ -636,7 +636,7 @@ def _without_tilts(setup: Setup, wrong: Mapping[int, float]) -> tuple[Setup, dic
         view = views[index]
         told = "the tilt of the stage" if view.stage is not None else "untilted"
         notes[view.name] = Finding(
-            f"scale: view {view.name} at magnification {view.magnification:g} contradicts {told} by "
+            f"scale: {view.name} at magnification {view.magnification:g} contradicts {told} by "
             f"{sigmas:.0f} sigma; its tilt is not used"
         )
         views[index] = replace(view, stage=None, untilted=False)

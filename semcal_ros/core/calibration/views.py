@@ -440,7 +440,7 @@ def refuse_tilted_lines(views: Sequence[GridView]) -> None:
         tilt = 0.0 if view.stage is None or view.stage.tilt_rad is None else view.stage.tilt_rad
         if abs(tilt) > LINES_TILT_MAX_RAD:
             raise CalibrationError(
-                f"view {view.name}, tilted by {np.degrees(tilt):.1f} degrees, among views of parallel lines",
+                f"{view.name}, tilted by {np.degrees(tilt):.1f} degrees, among views of parallel lines",
                 expected="untilted views: what a tilt does to lines in one direction, another scale does as well",
                 do="leave this view out, or use a grid of two directions",
             )

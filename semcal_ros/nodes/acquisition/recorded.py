@@ -83,7 +83,7 @@ def read_views(
         g, stage = frame.magnification, frame.stage
         if isinstance(found, Rejection) or not judge(g, grey, found, stage):
             return False
-        view = FoundView(f"view {len(taken)}", g, None, found, stage)
+        view = FoundView(view_name(len(taken)), g, None, found, stage)
         taken.append((view, replace(frame, image=frame.image[:0])))
         return True
 
@@ -92,6 +92,11 @@ def read_views(
         RecordedView(replace(view, visit=visit), frame.stamp_ns, frame.conditions or Conditions())
         for (view, frame), visit in zip(taken, visits, strict=True)
     ]
+
+
+def view_name(index: int) -> str:
+    """Return what the view of this index is called, as people count: view 1 is the first."""
+    return f"view {index + 1}"
 
 
 def read_pictures(

@@ -136,14 +136,16 @@ class StageInput:
         return doubt + [f"no joint {joint} on {self._source.topic}" for joint in self._missing]
 
     def at(self, stamp_ns: int) -> StageReading | None:
-        """Return the reading of a frame with this stamp, or None while it is unknown."""
+        """Return the reading of a frame with this stamp, or None while it is unknown; the newest one where the frame,
+        or the stage, has no stamp (0).
+        """
         if self._source is None:
             return None
         self._subscription.take_waiting()
         newest_ns = self._history.newest_ns
         reading = None
         if newest_ns is not None:
-            reading = self._history.at(stamp_ns if self._stamped else newest_ns)
+            reading = self._history.at(stamp_ns if self._stamped and stamp_ns else newest_ns)
         tilt = None if reading is None else reading.tilt_rad
         self._reporter.note("stage_tilt_rad", "unknown" if tilt is None else tilt)
         return reading

@@ -262,6 +262,7 @@ class FrameInput:
         self._mixed_in_a_row = 0
         self._dark = ""
         self._checked_s = -_CHECK_S
+        self._unused = ""
 
     def _on_images(self, message: Any, info: MessageInfo) -> None:
         """Process the images that have arrived, oldest first, but skip late ones if there are newer ones.
@@ -301,12 +302,19 @@ class FrameInput:
             self._magnification.doubt(self._sent_ns)
         self._restarts = self._images.restarts
         interval_s = self._interval_s(published_ns(info), missed)
+        unused = ""
         try:
             frame = self._frame(message, info, interval_s)
             if frame and (not frame.mixed or self._takes_mixed()):
                 self._on_frame(frame)
+            if frame and frame.mixed:
+                unused = "it was scanned while the magnification changed"
+            elif frame and frame.magnification is None:
+                unused = "its magnification is not known"
         except NODE_ERRORS as error:
             self._reporter.reject(error)
+            unused = str(error)
+        self._unused = unused
         self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))
 
     def _takes_mixed(self) -> bool:
@@ -402,6 +410,15 @@ class FrameInput:
         if found:
             raise InvalidValueError(
                 found, expected="one", do="end the others; remove views taken meanwhile by ~/clear"
+            )
+
+    def refuse_unused(self) -> None:
+        """Refuse to go on with an older frame where the newest one is of no use; raises :class:`InvalidValueError`."""
+        if self._unused:
+            raise InvalidValueError(
+                f"the newest frame cannot be used: {self._unused}",
+                expected="one of a known encoding and magnification",
+                do="check the publishers of images and magnification",
             )
 
     @property

@@ -40,6 +40,7 @@ from semcal_ros.core.wording import counted
 from semcal_ros.nodes.workers.child_process import Channel, ChildProcess, ChildProcessEnded
 from semcal_ros.workflows.calibrate import calibrate_found
 from semcal_ros.workflows.extend import extend_by_pictures
+from semcal_ros.workflows.find_grid import name_rejected
 
 # How often a running calibration asks whether it is still wanted: a person notices no delay at a stop.
 _POLL_S = 0.1
@@ -102,8 +103,12 @@ class CalibrationJob:
         worst = f", held-out RMS up to {max(held_out):.3f} px" if held_out else ""
         low, high = done.calibration.magnification_range
         used = counted(len(done.collected.views), "view")
+        left_out = done.collected.rejected
+        if left_out:
+            used += f" of {len(self.views)}"
         summary = f"{self.options.method} calibration from {used}, {low:g}x to {high:g}x{worst}"
-        return done.calibration, summary, (*self.notes, *done.result.warnings)
+        notes = [f"left out: {text}" for text in name_rejected(left_out)]
+        return done.calibration, summary, (*notes, *self.notes, *done.result.warnings)
 
 
 @dataclass(frozen=True, eq=False)

@@ -235,7 +235,7 @@ def test_a_tilt_that_contradicts_the_image_is_named_and_not_used():
     views = views_of(stage, seed=9, readings=True)
     result = calibrated(_read(views, tilt_rad=views[20].stage.tilt_rad + 0.1), axis=StageAxis(0.2))
     (note,) = (note for note in scale_notes(result) if "contradicts" in note)
-    assert f"view {views[20].name} at magnification" in note
+    assert f"{views[20].name} at magnification" in note
     assert_honest(result)
     # The axis: beside the beam, across its direction of 0.2 rad.
     truth = 1.6e-4 * np.array([-np.sin(0.2), np.cos(0.2)])
@@ -254,7 +254,7 @@ def test_a_wrong_tilt_takes_no_sound_one_with_it(seed):
     wrong = replace(views[2], stage=replace(views[2].stage, tilt_rad=views[2].stage.tilt_rad - 0.1))
     result = calibrated([*views[:2], wrong, views[3]], axis=StageAxis(0.2))
     (note,) = (note for note in scale_notes(result) if "contradicts" in note)
-    assert f"view {wrong.name} at magnification" in note
+    assert f"{wrong.name} at magnification" in note
 
 
 @pytest.mark.slow

@@ -85,6 +85,13 @@ def test_without_stamps_the_newest_counts() -> None:
     assert bench.tilt_at(5.0) == 0.2
 
 
+def test_of_a_frame_without_a_stamp_the_newest_counts() -> None:
+    bench = Bench()
+    bench.publish(joints(1, tilt=0.1))
+    bench.publish(joints(5, tilt=0.2))
+    assert bench.tilt_at(0.0) == 0.2
+
+
 def test_a_clock_that_goes_back_forgets() -> None:
     bench = Bench()
     bench.publish(joints(50, tilt=0.1))

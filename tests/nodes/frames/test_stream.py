@@ -241,6 +241,36 @@ def test_images_or_magnifications_of_two_publishers_are_refused_where_they_would
     assert bench.stamps_s == [1.0]
 
 
+def test_an_older_frame_is_refused_where_the_newest_one_is_of_no_use() -> None:
+    bench = Bench()
+
+    def refused() -> str:
+        with pytest.raises(InvalidValueError, match="the newest frame cannot be used: ") as error:
+            bench.input.refuse_unused()
+        return str(error.value)
+
+    def sent(message: Any, at_s: float) -> None:
+        info = {"source_timestamp": round(at_s * 1e9), "received_timestamp": time.time_ns()}
+        bench.images.callback(message, info)
+
+    bench.receive(1.0)
+    assert "its magnification is not known" in refused()
+    bench.magnification(1000.0, sent_ns=1_500_000_000)
+    bench.receive(2.0)
+    bench.input.refuse_unused()
+    # Its stamp is the begin of a scan of 0.1 s.
+    bench.magnification(2000.0, sent_ns=3_050_000_000)
+    sent(image_message(IMAGE, 3.0), 3.1)
+    assert "while the magnification changed" in refused()
+    bench.receive(4.0)
+    bench.input.refuse_unused()
+    message = image_message(IMAGE, 5.0)
+    message.encoding = "bgra8"
+    sent(message, 5.1)
+    assert "bgra8" in refused()
+    assert len(bench.frames) == 3
+
+
 def test_images_before_their_magnification_are_counted_and_told_once_it_has_come() -> None:
     reporter, log = fake_reporter()
     node: Any = SimpleNamespace(reporter=reporter, _waiting=0, _without_magnification=0)

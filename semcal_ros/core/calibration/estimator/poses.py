@@ -140,7 +140,7 @@ def pose_from_camera(view: GridView, camera: ScanCamera) -> tuple[Array, Array]:
     known = np.all(np.isfinite(ideal), axis=1)
     if known.sum() < 4:
         raise CalibrationError(
-            f"view {view.name}, in which the calibration can undistort only {counted(known.sum(), 'corner')}",
+            f"{view.name}, in which the calibration can undistort only {counted(known.sum(), 'corner')}",
             expected="images of the microscope that was calibrated",
             do="check the magnification and --display-width",
         )
