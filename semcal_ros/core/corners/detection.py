@@ -76,6 +76,7 @@ from semcal_ros.core.corners.thresholds import (
     GROWN_MIN,
     LATTICES_TRIED,
     MINIMUM_CORNERS,
+    QUALITY_MIN,
     SAME_AREA_LOG,
     SCALE_MAX_PART,
     SCALES_PX,
@@ -446,6 +447,47 @@ def _measure(
     pyramid: _Pyramid, candidate: _Candidate, shape: CellShape
 ) -> LatticeDetection | Rejection[LatticeStatus]:
     """Fit the points of a pattern, at full resolution or where most of them pass, and judge them."""
+    best = _refine_best(pyramid, candidate, shape)
+    if shape.pattern == "chess" and (best is None or best.quality < QUALITY_MIN):
+        # Rounded squares with bright edges have two saddle points at a corner, which are one where it is smoothed.
+        smoother = _grow_smoothly(pyramid, candidate)
+        again = None if smoother is None else _refine_best(pyramid, smoother, shape)
+        if again is not None and (best is None or _passed(again) > _passed(best)):
+            best = again
+    if best is None:
+        return Rejection(
+            LatticeStatus.NO_LATTICE,
+            f"no grid: a regular pattern, but its {_POINTS[shape.pattern]} are not alike",
+        )
+    if shape.pattern == "chess":
+        return _judge_chess(pyramid, candidate, best)
+    return _judge(best, candidate, pyramid.size, shape.pattern)
+
+
+def _grow_smoothly(pyramid: _Pyramid, candidate: _Candidate) -> _Candidate | None:
+    """The candidate with a lattice through the saddle points at the scale that suits its squares; None if there is no
+    such lattice.
+    """
+    spacing = float(np.median(np.linalg.norm(candidate.corners.axes, axis=2)))
+    largest = SCALE_MAX_PART * min(pyramid.size)
+    scale = min(
+        (s for s in SCALES_PX if s <= largest),
+        key=lambda s: abs(np.log(4.0 * s / spacing)),
+        default=0.0,
+    )
+    if scale <= SCALES_PX[0]:
+        return None
+    octave = int(np.log2(scale / SCALES_PX[0]))
+    corners = grow_at_scale(pyramid.level(octave), scale, octave, pyramid.size)
+    if corners is None or len(corners.ij) < GROWN_MIN:
+        return None
+    return replace(candidate, corners=corners)
+
+
+def _refine_best(
+    pyramid: _Pyramid, candidate: _Candidate, shape: CellShape
+) -> RefinedCorners | None:
+    """Fit the points of a pattern at full resolution, or where most of them pass."""
     best: RefinedCorners | None = None
     spacing = np.linalg.norm(candidate.corners.axes, axis=2)
     if shape.pattern != "chess" and candidate.cells is not None:
@@ -459,14 +501,7 @@ def _measure(
             best = points
         if best is not None and best.quality > CONVINCING_PART:
             break
-    if best is None:
-        return Rejection(
-            LatticeStatus.NO_LATTICE,
-            f"no grid: a regular pattern, but its {_POINTS[shape.pattern]} are not alike",
-        )
-    if shape.pattern == "chess":
-        return _judge_chess(pyramid, candidate, best)
-    return _judge(best, candidate, pyramid.size, shape.pattern)
+    return best
 
 
 def _passed(points: RefinedCorners) -> float:
@@ -526,7 +561,7 @@ def _judge(
 ) -> LatticeDetection | Rejection[LatticeStatus]:
     """Return the points of a candidate, if they are good enough."""
     what = _POINTS[pattern]
-    if points.quality < 0.5:
+    if points.quality < QUALITY_MIN:
         return Rejection(
             LatticeStatus.NO_LATTICE,
             f"no grid: only {round(100 * points.quality)} % of the expected {what}"

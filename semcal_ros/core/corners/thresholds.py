@@ -829,6 +829,10 @@ FILLED_PART = TABLE.stated(
     "FILLED_PART", 0.6, "of the image",
     "A lattice whose regular squares cover so much will not be surpassed at another scale.",
 )
+QUALITY_MIN = TABLE.stated(
+    "QUALITY_MIN", 0.5, "of the expected points",
+    "That must pass: what is a grid in less than half of its points is something else, or damaged beyond use.",
+)
 CONVINCING_PART = TABLE.stated(
     "CONVINCING_PART", 0.8, "of the expected points",
     "That pass, beyond which no coarser picture shows more of them.",

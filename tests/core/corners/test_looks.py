@@ -81,3 +81,44 @@ def test_edges_that_are_rougher_than_the_noise_are_in_the_sigma() -> None:
     assert isinstance(still, LatticeDetection)
     assert isinstance(moved, LatticeDetection)
     assert np.median(moved.sigma_px) > 1.5 * np.median(still.sigma_px)
+
+
+def draw_rounded(
+    square: float, rounded: float, edge: float, electrons: float, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Dark squares with rounded corners and bright edges on a bright ground, 640 px wide; and their (n, 2) corners."""
+    size, turn = 640, np.radians(12.0)
+    c, s = np.cos(turn), np.sin(turn)
+    y, x = np.mgrid[0.0:size, 0.0:size] - 0.5 * size + 3.3
+    u, v = (c * x + s * y) / square, (-s * x + c * y) / square
+    is_dark = (np.floor(u) + np.floor(v)) % 2 == 0
+    u, v = np.abs(u - np.floor(u) - 0.5), np.abs(v - np.floor(v) - 0.5)
+    beyond = np.maximum(np.stack([u, v]) - 0.5 + rounded, 0.0)
+    depth = rounded - np.hypot(*beyond) + np.maximum(0.0, 0.5 - rounded - np.maximum(u, v))
+    soft = 1.0 / (1.0 + np.exp(-1.7 * depth * square / 1.5))
+    bright = 0.75 - 0.4 * np.where(is_dark, soft, 0.0)
+    bright += edge * np.exp(-np.minimum(0.5 - u, 0.5 - v) / 0.03)
+    level = np.random.default_rng(seed).poisson(bright * electrons) * 150.0 / electrons
+    k = np.arange(-9, 10) * square
+    corners = np.stack(np.meshgrid(k, k), axis=-1).reshape(-1, 2) @ [[c, s], [-s, c]]
+    return np.clip(np.rint(level), 0, 255).astype(np.uint8), corners + 0.5 * size - 3.3
+
+
+@pytest.mark.parametrize(
+    ("square", "rounded", "edge"), [(80.0, 0.15, 0.3), (80.0, 0.18, 0.2), (148.0, 0.15, 0.2)]
+)
+def test_rounded_squares_with_bright_edges_are_found(
+    square: float, rounded: float, edge: float
+) -> None:
+    """Where four of them meet, a bright spot lies between two saddle points, of which either is found."""
+    picture, corners = draw_rounded(square, rounded, edge, 300.0, seed=1)
+    found = find_lattice(picture)
+    assert isinstance(found, LatticeDetection)
+    assert found.pattern == "chess"
+    inside = np.all((corners >= 10.0) & (corners <= 629.0), axis=1)
+    assert len(found.xy) > 0.8 * np.sum(inside)
+    apart = np.linalg.norm(found.xy[:, None] - corners, axis=2)
+    errors = found.xy - corners[np.argmin(apart, axis=1)]
+    assert np.max(np.abs(errors)) < 1.5
+    scores = errors / found.sigma_px[:, None]
+    assert np.sqrt(np.mean(scores**2)) < 2.0
