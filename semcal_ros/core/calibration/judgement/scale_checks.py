@@ -265,10 +265,12 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
         )
     if setup.shared and not _is_repeatability_known(fit):
         presumed = estimate_repeatability(setup, fit)
+        groups = setup.visits[1]
+        which = "more" if len(np.unique(groups)) < len(groups) else "some"
         out.append(
             Finding(
                 "scale: the views do not show how repeatable the magnification is; "
-                f"{100.0 * presumed:.2g} % is presumed. Visit some magnifications twice",
+                f"{100.0 * presumed:.2g} % is presumed. Visit {which} magnifications twice",
                 cost_relative=presumed,
             )
         )
