@@ -238,7 +238,7 @@ def describe_recording(
         # All else can be told; the magnification only takes the place of the one that is missing.
         given = source if isinstance(source, RecordedFiles) else RecordedFiles(cast("str", source))
         recording = open_source(replace(given, magnification=1.0), microscope)
-        seen.no_scale = f"not known: {error.do}"
+        seen.no_scale = f"not known ({error.seen}): {error.do}"
     with recording as opened:
         advance = count_frames(on_progress, "reading", opened.frame_count)
         wanted = _choose(opened.frame_count)

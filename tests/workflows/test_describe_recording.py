@@ -163,7 +163,8 @@ def test_every_kind_of_file_is_described(tmp_path: Path, write: Any, count: int)
 def test_without_a_scale_the_rest_is_told(tmp_path: Path) -> None:
     found = describe_recording(_write_stack(tmp_path))
     assert found.settings == () and found.magnifications == ()
-    assert found.scale_source.startswith("not known: state it with --pixel-size")
+    assert found.scale_source.startswith("not known (s.tif without a pixel size: ")
+    assert "state it with --pixel-size" in found.scale_source
     assert (found.frame_count, found.grey_levels[0].stored_bits) == (4, 8)
 
 
