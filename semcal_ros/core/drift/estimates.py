@@ -186,16 +186,20 @@ class DriftUpdate(DriftEstimate):
         """Part of the frame that stays in place."""
         return 0.0 if self.fixed is None else self.fixed.share
 
-    def draw_apart(self, size: tuple[int, int], *, scale: float = 1.0) -> NDArray[np.uint8]:
+    def draw_apart(
+        self, size: tuple[int, int], *, scale: float = 1.0, zoom: float = 1.0
+    ) -> NDArray[np.uint8]:
         """(height, width) 255 where the corrected frame of (width, height) shows what does not move with the specimen:
-        what moves otherwise, and what stays in place. ``scale`` is that of the frame against what was measured.
+        what moves otherwise, and what stays in place. ``scale`` is by how many times more pixels the frame has than
+        what was measured, and ``zoom`` by how many times as large it shows the specimen, where it is another frame.
         """
         width, height = size
         drawn = np.zeros((height, width), dtype=np.uint8)
         drift_px = self.px_from_unit @ self.drift_m
-        for part in (self.moving, self.fixed):
+        # What stays in place does so at any magnification.
+        for part, seen in ((self.moving, zoom), (self.fixed, 1.0)):
             if part is not None:
-                drawn |= part.draw(size, moved_px=-drift_px, scale=scale)
+                drawn |= part.draw(size, moved_px=-drift_px, scale=scale, zoom=seen)
         return drawn
 
     @property

@@ -400,14 +400,25 @@ class MovingTiles:
         return np.asarray(padded.take(rows, axis=0).take(cols, axis=1))
 
     def draw(
-        self, size: tuple[int, int], *, moved_px: Array | None = None, scale: float = 1.0
+        self,
+        size: tuple[int, int],
+        *,
+        moved_px: Array | None = None,
+        scale: float = 1.0,
+        zoom: float = 1.0,
     ) -> NDArray[np.uint8]:
         """(height, width) image of (width, height): 255 where something moves.
 
-        The tiles are moved by ``moved_px`` (2,) before the image is made larger by ``scale``.
+        The tiles are moved by ``moved_px`` (2,), then seen ``zoom`` times as large from the middle of the image, before
+        that is made larger by ``scale``.
         """
         moved = np.zeros(2) if moved_px is None else moved_px
-        x, y = ((np.arange(n) + 0.5) / scale - 0.5 - by for n, by in zip(size, moved, strict=True))
+        places = []
+        for count, by in zip(size, moved, strict=True):
+            # Tiles are counted from the corner of the first pixel.
+            seen, middle = (np.arange(count) + 0.5) / scale, 0.5 * count / scale
+            places.append(middle + (seen - middle) / zoom - by)
+        x, y = places
         return np.asarray(self.at(x, y).view(np.uint8) * np.uint8(255))
 
     def grown(self) -> MovingTiles:

@@ -108,11 +108,14 @@ class FrameDrift:
         The latest frame whose drift was measured: this frame or an earlier one.
     binned
         Pixels of the frame per pixel of what was measured.
+    zoom
+        How many times as large the frame shows the specimen as the one that was measured.
     """
 
     estimate: DriftEstimate
     measured: DriftUpdate
     binned: int = 1
+    zoom: float = 1.0
 
     @property
     def is_forecast(self) -> bool:
@@ -126,7 +129,7 @@ class FrameDrift:
 
     def draw_moving(self, size: tuple[int, int]) -> NDArray[np.uint8]:
         """Return an image (height, width), 255 where the corrected frame shows what does not move with the specimen."""
-        return self.measured.draw_apart(size, scale=float(self.binned))
+        return self.measured.draw_apart(size, scale=float(self.binned), zoom=self.zoom)
 
 
 class LiveDrift:
@@ -204,7 +207,7 @@ class LiveDrift:
             small = self._bin(frame, camera)
             self._at_work = self._process.measure(tracker, *small, time_s, scan)
         assert self._latest is not None
-        return _estimate_at(self._latest, centre_s, self._binned)
+        return _estimate_at(self._latest, centre_s, self._binned, camera)
 
     def _bin(
         self, frame: StreamFrame, camera: ScanCamera
@@ -324,11 +327,16 @@ class DriftCorrection:
         return [self._output.trouble] * bool(self._output.trouble)
 
 
-def _estimate_at(latest: Measurement, centre_s: float, binned: int) -> FrameDrift:
+def _estimate_at(
+    latest: Measurement, centre_s: float, binned: int, camera: ScanCamera
+) -> FrameDrift:
     update = latest.update
     if centre_s == update.time_s:
         return FrameDrift(update, update, binned)
-    return FrameDrift(latest.predictor.at(centre_s), update, binned)
+    # The camera is that of the frame, of all of its pixels.
+    measured_px_per_m = np.sqrt(abs(np.linalg.det(update.px_from_unit)))
+    zoom = float(camera.m / binned / measured_px_per_m)
+    return FrameDrift(latest.predictor.at(centre_s), update, binned, zoom)
 
 
 class LoadMonitor:

@@ -113,7 +113,12 @@ def test_the_mask_lies_where_the_tiles_are() -> None:
     assert (rows.min(), rows.max(), cols.min(), cols.max()) == (13, 28, 23, 42)
     shifted = moving.draw((128, 96), moved_px=np.array([-3.0, -5.0]), scale=2.0)
     rows, cols = np.nonzero(shifted)
-    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (17, 48, 41, 80)
+    # Each pixel of 8 to 23 and 20 to 39 is two by two.
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (16, 47, 40, 79)
+    zoomed = moving.draw((64, 48), zoom=2.0)
+    rows, cols = np.nonzero(zoomed)
+    # From the middle, 24 and 32 px from the corner of the first pixel: rows 13 to 29 and columns 23 to 43.
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (2, 33, 14, 53)
 
 
 def test_one_tile_alone_is_no_body() -> None:

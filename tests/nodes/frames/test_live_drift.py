@@ -29,6 +29,7 @@ from semcal_ros.bridge.zero_order_hold import ZeroOrderHold, find_values, scan_i
 from semcal_ros.config.config import MicroscopeConfig, load_config, parse_config
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration.agreement import MovingTiles
 from semcal_ros.nodes.common.parameters import INTERPOLATION
 from semcal_ros.nodes.frames.compressed import compressed_parameters
 from semcal_ros.nodes.frames.live_drift import (
@@ -124,6 +125,28 @@ def test_a_shift_is_taken_out_of_the_image(bench: Bench) -> None:
     difference = bench.image.pixels[inside].astype(float) - IMAGE[inside]
     # A tenth of a pixel on a texture of this contrast; unshifted, they would differ by more than ten times this.
     assert np.sqrt(np.mean(np.square(difference))) < 0.1 * IMAGE.std()
+
+
+def test_what_moves_is_drawn_at_the_magnification_of_a_frame_that_was_not_measured(
+    bench: Bench,
+) -> None:
+    bench.receive(IMAGE, 1)
+    tracking: Any = bench.correction.tracking
+    tracking._parameters.set("drift_tracking", "forecast")
+    frame = StreamFrame(IMAGE, "mono8", image_message(IMAGE, 2.0).header, 2 * S, 10000.0, False)
+    twice = nominal_camera(10000.0, 128, 128, CONFIG.display_width_m)
+    drift = tracking.estimate(frame, twice)
+    assert drift.is_forecast
+    assert drift.zoom == pytest.approx(2.0, rel=1e-12)
+    mask = np.zeros((128, 128), dtype=bool)
+    mask[72:88, 80:88] = True
+    parts = MovingTiles.of_pixels(mask)
+    moves = replace(drift, measured=replace(drift.measured, moving=parts)).draw_moving((128, 128))
+    # From the middle of the image, 63.5 px; the drift is none.
+    assert np.argwhere(moves).min(axis=0).tolist() == [80, 96]
+    assert np.argwhere(moves).max(axis=0).tolist() == [111, 111]
+    stays = replace(drift, measured=replace(drift.measured, fixed=parts)).draw_moving((128, 128))
+    np.testing.assert_array_equal(stays > 0, mask)
 
 
 def test_a_frame_of_two_magnifications_has_no_drift(bench: Bench) -> None:
