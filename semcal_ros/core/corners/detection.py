@@ -374,15 +374,21 @@ class _Candidate:
         return self.shapes is not None and self.shapes.best.pattern == "chess"
 
 
+def _grow(pyramid: _Pyramid, scale: float) -> Lattice | None:
+    """Grow a lattice of the saddle points at a scale, px; None if there is none."""
+    octave = max(0, int(np.log2(scale / SCALES_PX[0])))
+    corners = grow_at_scale(pyramid.level(octave), scale, octave, pyramid.size)
+    return None if corners is None or len(corners.ij) < GROWN_MIN else corners
+
+
 def _search(pyramid: _Pyramid) -> Iterator[_Candidate]:
     """Find lattices scale by scale; a clear checkerboard that fills the image ends the search."""
     image, size = pyramid.image, pyramid.size
     for scale in SCALES_PX:
         if scale > SCALE_MAX_PART * min(size) and scale > SCALES_PX[0]:
             continue
-        octave = max(0, int(np.log2(scale / SCALES_PX[0])))
-        corners = grow_at_scale(pyramid.level(octave), scale, octave, size)
-        if corners is None or len(corners.ij) < GROWN_MIN:
+        corners = _grow(pyramid, scale)
+        if corners is None:
             continue
         bright = bright_cells(image, corners)
         cells = None if bright is None else split_mixture(pyramid.level, bright)
@@ -477,11 +483,8 @@ def _grow_smoothly(pyramid: _Pyramid, candidate: _Candidate) -> _Candidate | Non
     )
     if scale <= SCALES_PX[0]:
         return None
-    octave = int(np.log2(scale / SCALES_PX[0]))
-    corners = grow_at_scale(pyramid.level(octave), scale, octave, pyramid.size)
-    if corners is None or len(corners.ij) < GROWN_MIN:
-        return None
-    return replace(candidate, corners=corners)
+    corners = _grow(pyramid, scale)
+    return None if corners is None else replace(candidate, corners=corners)
 
 
 def _refine_best(
