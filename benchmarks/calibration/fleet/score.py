@@ -35,7 +35,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -60,6 +60,8 @@ LATER_HEIGHT_M = CalibrationOptions().height_sigma_m
 # Tilts of the planes whose points are compared, and the directions of their axes, rad.
 PLANES = ((0.0, 0.0), (0.5, 0.3), (0.5, 1.9))
 POINTS_ACROSS = 13
+# By how much one view's magnification is stated wrongly, where it is not that of the magnification before or after.
+MISSTATED = (0.02, 0.15)
 # Steps of the pose fit at most. The tilt of a plane seen from above acts by its square, so that some take hundreds.
 _STEPS = 1000
 
@@ -84,6 +86,10 @@ class Outcome:
         The same errors against the next visit.
     literal_sigmas
         Errors of ``pixel_size_m`` over its sigma, where it has but one meaning; else empty.
+    views_left_out
+        How many views were left out, without the one that ought to be.
+    misstated, has_found
+        By what factor the magnification of one view was stated wrongly, 1 if none was, and whether it was left out.
     """
 
     index: int
@@ -107,6 +113,8 @@ class Outcome:
     excess_px: float = 0.0
     repeatability: float = 0.0
     messages: tuple[str, ...] = ()
+    misstated: float = 1.0
+    has_found: bool = False
 
     @property
     def worst_px(self) -> float:
@@ -166,11 +174,41 @@ def views_of(own: Microscope) -> list[GridView]:
     ]
 
 
-def judge(seed: int, index: int) -> tuple[Outcome, str]:
-    """The outcome of one microscope, and the traceback if there is one."""
+def misstate_one(own: Microscope, views: Sequence[GridView]) -> tuple[list[GridView], int, float]:
+    """The views with a wrong magnification for one of them, which one, and by what factor.
+
+    Half of the time it is by MISSTATED in either direction, as of a setting that was rounded or read too early; else
+    the one view has the magnification before or after its own, as of a file that was copied to the wrong place.
+    """
+    rng = np.random.default_rng((own.seed, own.index, 3))
+    out, chosen = list(views), int(rng.integers(len(views)))
+    wrong, g = out[chosen], own.magnifications
+    at = g.index(wrong.magnification)
+    neighbours = [g[k] for k in (at - 1, at + 1) if 0 <= k < len(g)]
+    if rng.uniform() < 0.5:
+        factor = float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(*MISSTATED)))
+        # What states the magnification states the size of the squares with it: they are told from one another by it.
+        out[chosen] = replace(wrong, board_xy_m=wrong.board_xy_m / factor)
+    else:
+        stated = float(rng.choice(neighbours))
+        factor = stated / wrong.magnification
+        out[chosen] = replace(wrong, magnification=stated)
+    return out, chosen, factor
+
+
+def judge(seed: int, index: int, *, misstate: bool = False) -> tuple[Outcome, str]:
+    """The outcome of one microscope, and the traceback if there is one.
+
+    With ``misstate`` the magnification of one view is wrong (:func:`misstate_one`).
+    """
     own = draw_microscope(seed, index)
     views = views_of(own)
+    wrong, factor = "", 1.0
+    if misstate:
+        views, chosen, factor = misstate_one(own, views)
+        wrong = views[chosen].name
     facts = {
+        "misstated": factor,
         "index": index,
         "microscope": asdict(own),
         "corners": sum(len(view.image_xy) for view in views),
@@ -199,7 +237,10 @@ def judge(seed: int, index: int) -> tuple[Outcome, str]:
     if result is None:
         return Outcome(**facts), trace
     with np.errstate(all="ignore"):
-        return Outcome(**facts, **score(own, result)), ""
+        facts |= score(own, result)
+    left_out = {view.name for view in result.outliers}
+    facts |= {"has_found": wrong in left_out, "views_left_out": len(left_out - {wrong})}
+    return Outcome(**facts), ""
 
 
 def _places(error: BaseException) -> tuple[str, ...]:
@@ -237,7 +278,6 @@ def score(own: Microscope, result: CalibrationResult) -> dict[str, object]:
         "nm_next": tuple(later for _, later, _ in lengths),
         "nm_sigma": tuple(sigma for _, _, sigma in lengths),
         "literal_sigmas": tuple(literal),
-        "views_left_out": len(result.outliers),
         "has_field": model.residual is not None,
         "excess_px": float(model.statistics.get("excess_sigma_px", 0.0)),
         "repeatability": model.scale_sigma.repeatability,

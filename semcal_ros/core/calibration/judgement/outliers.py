@@ -51,6 +51,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     OUTLIER_FALSE_ALARMS,
     SHAPE_SPREAD_MIN,
     STEP_LEFT_MIN,
+    SWAMPED_PART,
     TILT_SIGMAS,
     USUAL_VIEWS,
     VIEWS_MIN,
@@ -372,11 +373,15 @@ def find_outliers(
 ) -> Mapping[int, Rejection[ViewStatus]]:
     """Find the views that disagree with the others; index and reason of each.
 
-    ``problem`` and ``result`` are the adjustment, ``usual_height_m`` is as for :func:`measure_deviations`. Where half
-    of the views at a magnification disagree, or many in all, the fault is not in single views, and none is returned.
+    ``problem`` and ``result`` are the adjustment, ``usual_height_m`` is as for :func:`measure_deviations`. One wrong
+    view makes sound ones look wrong that are compared with it (swamping: Davies and Gather 1993,
+    doi:10.1080/01621459.1993.10476339), so only those are returned that are nearly as odd as the oddest: a fit without
+    these tells of the others. Where they are half of the views at a magnification, or many in all, the fault is not in
+    single views, and none is returned.
     """
     found = measure_deviations(problem, result, usual_height_m)
-    odd = (found.of_limit > 1.0) | (found.misfit > MISFIT_RATIO)
+    oddness = np.maximum(found.of_limit, found.misfit / MISFIT_RATIO)
+    odd = oddness > max(1.0, SWAMPED_PART * float(oddness.max()))
     outliers: dict[int, Rejection[ViewStatus]] = {}
     if odd.sum() > max(1.0, WRONG_PART_MAX * len(odd)) or 2 * odd.sum() >= len(odd):
         return outliers

@@ -178,6 +178,11 @@ VIEWS_MIN = TABLE.stated(
     "VIEWS_MIN", 3, "views",
     "Where a magnification has fewer, they are compared with those at all.",
 )
+SWAMPED_PART = TABLE.derived(
+    "SWAMPED_PART", 0.75, "of the oddest",
+    "What is less odd waits for a fit without the oddest: a median of two views of which one is wrong is wrong by half "
+    "as much, and so is what is compared with it; this is half-way from there to the oddest itself.",
+)
 WRONG_PART_MAX = TABLE.stated(
     "WRONG_PART_MAX", 0.1, "of the views",
     "Single views are wrong, not many.",
