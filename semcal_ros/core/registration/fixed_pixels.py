@@ -35,7 +35,7 @@ from semcal_ros.core.registration.tiles import drop_pixels
 def grow_mask(mask: Mask, by_px: int) -> Mask:
     """The mask (h, w) enlarged by so many pixels along each axis."""
     kernel = np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+    return np.asarray(cv2.dilate(np.ascontiguousarray(mask).view(np.uint8), kernel)).view(bool)
 
 
 def drop_fixed_pixels(
