@@ -135,6 +135,9 @@ class DriftUpdate(DriftEstimate):
     doubt
         (2, 2) the part of the covariance that is due to images that contradict the prediction, this one or
         those before; zero where the drift rests on the frame's own image.
+    jump
+        (2, 2) square of the part of the drift that was not expected at this frame, and is believed: when it came about
+        since the last frame that was used is not known. Zero where it was expected.
     along
         (2,) direction of the lines that frames show, px: the drift along them is only predicted; None where both
         directions are measured.
@@ -168,6 +171,7 @@ class DriftUpdate(DriftEstimate):
     keyframe_time_s: float
     merged: bool
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
+    jump: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     along: Array | None = field(default=None, kw_only=True)
     unseen: Array = field(default_factory=lambda: np.zeros((2, 2)), kw_only=True)
     moving: MovingTiles | None = field(default=None, kw_only=True)

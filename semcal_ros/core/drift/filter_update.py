@@ -74,7 +74,7 @@ def use_match(
     if sees_again:
         state = state.apply(anywhere).see_again()
     if judged is not None:
-        state = state.inflate(judged)
+        state = replace(state.inflate(judged), jump=np.outer(innovation, innovation))
     if along is not None:
         state = replace(state, lines=state.lines.begin_or_go_on(along, state.filter))
     since_s = drift.time_s - state.time_s

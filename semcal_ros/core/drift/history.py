@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
@@ -92,7 +93,7 @@ class DriftHistory:
                 )
             states = smooth(drift_filter.start, drift_filter.events, process_noise)
             turns, first_s = similarity.smooth(), drift_filter.start.time_s
-            resolved = _find_resolved(stretch.updates)
+            doubts = _find_doubts(stretch.updates)
             for k, (update, state, turn) in enumerate(
                 zip(stretch.updates, states, turns, strict=True)
             ):
@@ -102,24 +103,30 @@ class DriftHistory:
                     updates.append(update)
                     continue
                 smoothed = _smoothed(update, state, turn, camera)
-                smoothed.covariance[:2, :2] += update.unseen
-                if not resolved[k]:
-                    smoothed.covariance[:2, :2] += update.doubt
+                smoothed.covariance[:2, :2] += update.unseen + doubts[k]
                 if update.time_s > first_s:
                     smoothed.covariance[:2, :2] += process_noise.flicker_covariance
                 updates.append(smoothed)
         return DriftPath(tuple(updates))
 
 
-def _find_resolved(stretch: list[DriftUpdate]) -> list[bool]:
-    """Whether each frame, or one after it, was matched with the keyframes from before it: the specimen
-    came back to where the path expects it.
+def _find_doubts(stretch: list[DriftUpdate]) -> list[Array]:
+    """(2, 2) what is in doubt of each frame with hindsight, besides the covariance of the path.
+
+    Nothing is where a frame after it was matched with the keyframes from before it, and the specimen had come back to
+    where the path expects it. If it had not, nobody knows when it went: the path takes the frames that were not used in
+    between to be where they would be without that.
     """
-    resolved, after = [], False
+    doubts: list[Array] = []
+    after: Array | None = None
     for update in reversed(stretch):
-        after = not update.restarted and (after or update.accepted)
-        resolved.append(after)
-    return resolved[::-1]
+        if update.restarted:
+            after = None
+        elif update.accepted:
+            after = update.jump
+        rests_on_itself = update.accepted and not update.restarted
+        doubts.append(update.doubt if rests_on_itself or after is None else after)
+    return doubts[::-1]
 
 
 def _smoothed(

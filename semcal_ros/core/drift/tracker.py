@@ -174,7 +174,7 @@ def _predict(
     reach = speed * max(late_s, state.late_s)
     if reach > 0.0:
         state = state.inflate(inflate_position(np.eye(2) * reach**2))
-    return replace(state, late_s=late_s)
+    return replace(state, late_s=late_s, jump=np.zeros((2, 2)))
 
 
 def _follow(

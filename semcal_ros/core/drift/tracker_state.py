@@ -90,6 +90,9 @@ class TrackerState:
     doubt
         (2, 2) what the last frames that contradict the prediction add to the covariance of the drift, until one
         matches.
+    jump
+        (2, 2) square of the part of the drift at the latest frame that was not expected, and is believed since the frame
+        before was there already, or it is no further than drift gets; zero where it was expected.
     moving, body
         What did not move with the specimen in the last frame that matched, and what measures its motion.
     static
@@ -112,6 +115,7 @@ class TrackerState:
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    jump: Array = field(default_factory=lambda: np.zeros((2, 2)))
     moving: MovingTiles | None = None
     body: OwnMotionEstimator = field(default_factory=OwnMotionEstimator)
     static: StaticParts = field(default_factory=StaticParts)
@@ -225,6 +229,7 @@ def make_update(
         similarity=similarity.mean,
         similarity_covariance=similarity.covariance,
         doubt=state.doubt,
+        jump=state.jump,
         unseen=unseen,
         along=state.lines.along,
         moving=None if registration is None else registration.moving,

@@ -555,6 +555,24 @@ def test_a_place_that_was_doubted_and_found_again_is_certain_with_hindsight() ->
     assert history.smooth().sigma_m[8, 0] < 0.5
 
 
+@pytest.mark.parametrize("jump_px", [12.0, 35.0])
+def test_the_first_frame_after_a_step_of_the_stage_is_not_certain_with_hindsight(
+    jump_px: float,
+) -> None:
+    """It is refused, and the path puts it where it would be without the step."""
+    texture = Texture(4)
+    x_px = np.array([0.5 * k + jump_px * (k >= 8) for k in range(14)])
+    views = [noisy(texture.view((float(x), 0.0), 160), 4.0, k) for k, x in enumerate(x_px)]
+    updates, _, history = _track(views)
+    assert not updates[8].accepted
+    assert all(u.accepted for u in updates[9:])
+    path = history.smooth()
+    off = np.abs(path.drift_m[:, 0] - x_px)
+    assert off[8] > 0.5 * jump_px
+    assert np.all(off <= 3.0 * path.sigma_m[:, 0] + 1e-9)
+    assert np.all(np.delete(path.sigma_m[:, 0], 8) < 0.2)
+
+
 @pytest.mark.parametrize(
     ("kind", "jump_px", "said"),
     [("tool over gold", 8.0, "ambiguous"), ("two tools", 3.0, "coarse and fine shift differ")],
