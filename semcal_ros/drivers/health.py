@@ -42,14 +42,18 @@ _SAME_VOLTAGE = 0.01
 def is_blank(image: NDArray[Any]) -> bool:
     """Return whether an image shows nothing: its grey levels lie within a sixtieth of the range.
 
+    Numbers that are no integers have no range: an image of them shows nothing where all are the same, or none is finite.
+
     Parameters
     ----------
     image
-        (h, w) of an integer type.
+        (h, w) of any type.
     """
     rows = image[:: max(1, image.shape[0] // _ROWS)]
     # Single bright pixels, as of cosmic rays or of a marker, are no picture.
     low, high = np.percentile(rows, (0.5, 99.5))
+    if image.dtype.kind == "f":
+        return not high > low
     return bool(high - low <= _BLANK_SPREAD * np.iinfo(image.dtype).max)
 
 

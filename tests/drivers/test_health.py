@@ -44,6 +44,13 @@ def test_blank_images(dtype: type) -> None:
     assert not is_blank(dark)
 
 
+def test_blank_images_of_numbers_that_have_no_range() -> None:
+    picture = np.random.default_rng(2).normal(1e-9, 1e-10, (200, 100)).astype(np.float32)
+    assert not is_blank(picture)
+    assert is_blank(np.full_like(picture, 0.25))
+    assert is_blank(np.full_like(picture, np.nan))
+
+
 def test_one_dark_frame_is_no_blanked_beam() -> None:
     watch = FrameWatch()
     assert watch.see(frame(dark=True)) == []
