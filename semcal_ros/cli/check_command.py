@@ -222,7 +222,8 @@ def echo_check(result: CalibrationCheck) -> None:
         ["", "images against calibration", "z", "px at most", "nm at most", "probability", ""], rows
     )
     click.echo(
-        f"nm per px is off by {-100.0 * result.scale_change:+.3f} +- {100.0 * result.scale_sigma:.3f} %; "
+        f"the images have {-100.0 * result.scale_change:+.3f} +- {100.0 * result.scale_sigma:.3f} % more nm per px "
+        f"than calibrated; "
         f"{counted(result.views, 'view')}, RMS {result.rms_px:.4f} px"
         + (f", {result.out_of_range} outside the calibrated range" if result.out_of_range else "")
     )

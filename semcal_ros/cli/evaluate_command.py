@@ -70,7 +70,7 @@ def command(
         echo_json(summary)
         return
     echo_table(
-        ["magnification", "views", "RMS px", "nm per px off by %", ""],
+        ["magnification", "views", "RMS px", "calibrated above seen nm per px, %", ""],
         [
             [
                 f"{row.magnification:g}",
