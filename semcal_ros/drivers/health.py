@@ -42,7 +42,7 @@ _SAME_VOLTAGE = 0.01
 def is_blank(image: NDArray[Any]) -> bool:
     """Return whether an image shows nothing: its grey levels lie within a sixtieth of the range.
 
-    Numbers that are no integers have no range: an image of them shows nothing where all are the same, or none is finite.
+    Floats have no range: an image of them shows nothing where all are the same, or none is finite.
 
     Parameters
     ----------

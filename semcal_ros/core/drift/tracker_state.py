@@ -91,8 +91,8 @@ class TrackerState:
         (2, 2) what the last frames that contradict the prediction add to the covariance of the drift, until one
         matches.
     jump
-        (2, 2) square of the part of the drift at the latest frame that was not expected, and is believed since the frame
-        before was there already, or it is no further than drift gets; zero where it was expected.
+        (2, 2) square of the part of the drift at the latest frame that was not expected, and is believed: the frame
+        before was there already, or it is no further than drift gets. Zero where it was expected.
     moving, body
         What did not move with the specimen in the last frame that matched, and what measures its motion.
     static
