@@ -313,7 +313,34 @@ def measure_deviations(
         if len(lattices):
             bend, _ = _limit(stretch[rest], count - 1, count, SHAPE_SPREAD_MIN, SHAPE_SPREAD_MIN)
             of_limit[v] = np.hypot(of_limit[v], stretch[v] / bend)
+    of_limit = np.hypot(of_limit, _visits_of_limit(problem, result))
     return Deviations(height, stretch, misfit, others, of_limit)
+
+
+def _visits_of_limit(problem: Problem, result: BundleResult) -> Array:
+    """(V,) deviation of scale and height of a view's visit from those of other visits, over the limit for it, where the
+    visit has no other view; else 0.
+
+    A view whose magnification is stated wrongly is a visit of its own, whose scale or height explains that.
+    """
+    out = np.zeros(len(problem.group))
+    effects = problem.effects
+    if effects is None:
+        return out
+    count = np.bincount(effects.visit)
+    for v in np.flatnonzero(count[effects.visit] == 1):
+        own = effects.visit[v]
+        for k, (usual, least) in enumerate(
+            (
+                (Priors.visit_scale_sigma, SHAPE_SPREAD_MIN),
+                (Priors.visit_height_sigma_m, HEIGHT_SPREAD_MIN_M),
+            )
+        ):
+            others = np.delete(result.state.visits[:, k], own)
+            middle = float(np.median(others)) if len(others) else 0.0
+            limit, _ = _limit(others - middle, len(others), len(count), usual, least)
+            out[v] = np.hypot(out[v], (result.state.visits[own, k] - middle) / limit)
+    return out
 
 
 def _heights_without(problem: Problem, height: Array, view: int) -> tuple[Array, int]:
