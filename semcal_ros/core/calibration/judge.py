@@ -368,6 +368,7 @@ def judge(
     )
     if joint is not None:
         own = joint.adjustment
+        certificate = certify(own.functions, own.problem, own.result)
         # Under poses alone, a fine picture would show the shape of its grid: 1 part in 10 000 is 0.2 px at 2000 px from
         # the middle.
         left = np.split(own.result.residuals_px, own.problem.starts[1:-1])
@@ -377,7 +378,7 @@ def judge(
             record,
             visit_height_sigma_m=own.spread.visit_height.sigma if setup.shared else None,
             scale_shares=describe_shares(model, joint.parts),
-            certificate=certify(own.functions, own.problem, own.result),
+            certificate=certificate,
         )
     model = replace(model, record=record)
     result = CalibrationResult(model, setup.views, poses, held_out, findings, outliers)

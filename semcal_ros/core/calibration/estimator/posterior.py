@@ -446,7 +446,7 @@ def split_covariance(padded: PaddedAdjustment) -> CovarianceParts:
     The information is that of the corners and that of the priors, C^-1 = N + P, so that C = C N C + C P C: the first
     is what errors of the corners do to the estimate, the second what the priors stand for does. With all corners
     ``1 + t`` times as certain, C is ``((1 + t)^2 N + P)^-1``, whose derivative at t = 0 is -2 C N C. The
-    prior of the coefficients that were left out is diagonal.
+    prior of the coefficients that were left out is diagonal. Of equations without a solution, all parts are infinite.
     """
     problem, state = padded.problem, padded.result.state
 
@@ -455,9 +455,11 @@ def split_covariance(padded: PaddedAdjustment) -> CovarianceParts:
         return refine(scaled, state, max_iterations=0).covariance
 
     whole = padded.result.covariance
-    corners = (covariance(1.0 - CERTAINTY_STEP) - covariance(1.0 + CERTAINTY_STEP)) / (
-        4.0 * CERTAINTY_STEP
-    )
+    less, more = covariance(1.0 - CERTAINTY_STEP), covariance(1.0 + CERTAINTY_STEP)
+    if not np.all(np.isfinite([whole, less, more])):
+        nothing = np.full((len(state.theta) - len(problem.shared),) * 2, np.inf)
+        return CovarianceParts(nothing, nothing)
+    corners = (less - more) / (4.0 * CERTAINTY_STEP)
     left = _left_out(padded.chosen.functions, padded.functions)
     omitted = (whole[:, left] / problem.prior_sigma[left] ** 2) @ whole[left]
     factor = max(padded.variance_factor, 1.0)
