@@ -214,8 +214,9 @@ class CalibrationResult:
         return tuple(own.sentence(self.model) for own in rank_findings(self.findings, self.model))
 
 
-def _name_views_at(setup: Setup, g: float) -> str:
-    return " and ".join(v.name for v in setup.views if v.magnification == g)
+def _ask_views_at(setup: Setup, g: float) -> str:
+    names = [v.name for v in setup.views if v.magnification == g]
+    return f"{' and '.join(names)} {'was' if len(names) == 1 else 'were'} taken at {g:g}"
 
 
 def _name_few_beside(setup: Setup, change: ChangePoint) -> str:
@@ -224,8 +225,8 @@ def _name_few_beside(setup: Setup, change: ChangePoint) -> str:
     least = min((change.below, change.above), key=lambda g: counts[g])
     if counts[least] >= min(VIEWS_MIN, float(np.median(list(counts.values())))):
         return ""
-    names = _name_views_at(setup, least)
-    return f"look first whether {names} was taken at {least:g}, where there are fewer views than elsewhere; else, "
+    asked = _ask_views_at(setup, least)
+    return f"look first whether {asked}, where there are fewer views than elsewhere; else, "
 
 
 def _describe_change(setup: Setup, change: ChangePoint) -> Finding:
@@ -233,7 +234,7 @@ def _describe_change(setup: Setup, change: ChangePoint) -> Finding:
     if change.below == change.above:
         text = (
             f"the scale at magnification {change.below:g} departs {size} from what the others lead to expect: look "
-            f"whether {_name_views_at(setup, change.below)} was taken at {change.below:g}"
+            f"whether {_ask_views_at(setup, change.below)}"
         )
         return Finding(text, cost_relative=change.relative, magnification=change.below)
     text = (

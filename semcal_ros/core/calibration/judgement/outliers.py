@@ -262,15 +262,18 @@ class Deviations:
         its lattice; RMS residual over that of the median view.
     others_height_m
         (V,) RMS of such heights among the views with which it is compared, m.
+    visit_scale
+        (V,) relative scale of a view's visit about that of the others, where it has no other view; else 0.
     of_limit
-        (V,) deviation of height and stretch together, over the limit for it. A wrong scale is imitated by both in
-        part, as the projection lets it.
+        (V,) deviation of height, stretch and visit together, over the limit for it. A wrong scale is imitated by each
+        in part, as the projection lets it.
     """
 
     height_m: Array
     stretch: Array
     misfit: Array
     others_height_m: Array
+    visit_scale: Array
     of_limit: Array
 
     def reject(self, view: int) -> Rejection[ViewStatus]:
@@ -279,8 +282,8 @@ class Deviations:
             ViewStatus.OUTLIER,
             f"does not agree with the other views: {1e6 * self.height_m[view]:.0f} um of height, where the others "
             f"scatter by {1e6 * self.others_height_m[view]:.0f} um, a grid stretched by "
-            f"{100.0 * self.stretch[view]:.2g} %, and residuals {self.misfit[view]:.1f} times the usual; wrong "
-            "magnification, or a wrong square size",
+            f"{100.0 * self.stretch[view]:.2g} %, a scale that is off by {100.0 * abs(self.visit_scale[view]):.2g} % "
+            f"more, and residuals {self.misfit[view]:.1f} times the usual; wrong magnification, or a wrong square size",
         )
 
 
@@ -313,20 +316,21 @@ def measure_deviations(
         if len(lattices):
             bend, _ = _limit(stretch[rest], count - 1, count, SHAPE_SPREAD_MIN, SHAPE_SPREAD_MIN)
             of_limit[v] = np.hypot(of_limit[v], stretch[v] / bend)
-    of_limit = np.hypot(of_limit, _visits_of_limit(problem, result))
-    return Deviations(height, stretch, misfit, others, of_limit)
+    visit_scale, visit_of_limit = _measure_lone_visits(problem, result)
+    of_limit = np.hypot(of_limit, visit_of_limit)
+    return Deviations(height, stretch, misfit, others, visit_scale, of_limit)
 
 
-def _visits_of_limit(problem: Problem, result: BundleResult) -> Array:
-    """(V,) deviation of scale and height of a view's visit from those of other visits, over the limit for it, where the
-    visit has no other view; else 0.
+def _measure_lone_visits(problem: Problem, result: BundleResult) -> tuple[Array, Array]:
+    """Return the (V,) relative scales of visits about those of others, and the (V,) deviations of scale and height over
+    the limit for them, where a view is the only one of its visit; else 0.
 
     A view whose magnification is stated wrongly is a visit of its own, whose scale or height explains that.
     """
-    out = np.zeros(len(problem.group))
+    scale, out = np.zeros(len(problem.group)), np.zeros(len(problem.group))
     effects = problem.effects
     if effects is None:
-        return out
+        return scale, out
     count = np.bincount(effects.visit)
     for v in np.flatnonzero(count[effects.visit] == 1):
         own = effects.visit[v]
@@ -339,8 +343,10 @@ def _visits_of_limit(problem: Problem, result: BundleResult) -> Array:
             others = np.delete(result.state.visits[:, k], own)
             middle = float(np.median(others)) if len(others) else 0.0
             limit, _ = _limit(others - middle, len(others), len(count), usual, least)
-            out[v] = np.hypot(out[v], (result.state.visits[own, k] - middle) / limit)
-    return out
+            deviation = float(result.state.visits[own, k]) - middle
+            out[v] = np.hypot(out[v], deviation / limit)
+            scale[v] = deviation if k == 0 else scale[v]
+    return scale, out
 
 
 def _heights_without(problem: Problem, height: Array, view: int) -> tuple[Array, int]:
