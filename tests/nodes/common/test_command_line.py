@@ -112,7 +112,6 @@ import importlib
 import rclpy
 rclpy.init = None
 from semcal_ros.nodes.common.command_line import EXECUTABLES
-from tests.helpers.ros_process import running
 for name in EXECUTABLES:
     assert importlib.import_module(f"semcal_ros.nodes.{name}").main(["--help"]) == 0
     print("=====")
