@@ -331,21 +331,20 @@ def _measure_lone_visits(problem: Problem, result: BundleResult) -> tuple[Array,
     effects = problem.effects
     if effects is None:
         return scale, out
-    count = np.bincount(effects.visit)
+    visits, count = result.state.visits, np.bincount(effects.visit)
+    usual = Priors.visit_scale_sigma, Priors.visit_height_sigma_m
+    least = SHAPE_SPREAD_MIN, HEIGHT_SPREAD_MIN_M
     for v in np.flatnonzero(count[effects.visit] == 1):
         own = effects.visit[v]
-        for k, (usual, least) in enumerate(
-            (
-                (Priors.visit_scale_sigma, SHAPE_SPREAD_MIN),
-                (Priors.visit_height_sigma_m, HEIGHT_SPREAD_MIN_M),
-            )
-        ):
-            others = np.delete(result.state.visits[:, k], own)
-            middle = float(np.median(others)) if len(others) else 0.0
-            limit, _ = _limit(others - middle, len(others), len(count), usual, least)
-            deviation = float(result.state.visits[own, k]) - middle
-            out[v] = np.hypot(out[v], deviation / limit)
-            scale[v] = deviation if k == 0 else scale[v]
+        others = np.delete(visits, own, axis=0)
+        middle = np.median(others, axis=0) if len(others) else np.zeros(2)
+        deviation = visits[own] - middle
+        limits = [
+            _limit(spread, len(others), len(count), *known)[0]
+            for spread, *known in zip((others - middle).T, usual, least, strict=True)
+        ]
+        scale[v] = deviation[0]
+        out[v] = np.hypot(*(deviation / limits))
     return scale, out
 
 
