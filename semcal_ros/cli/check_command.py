@@ -223,8 +223,7 @@ def echo_check(result: CalibrationCheck) -> None:
     )
     click.echo(
         f"the images have {-100.0 * result.scale_change:+.3f} +- {100.0 * result.scale_sigma:.3f} % more nm per px "
-        f"than calibrated; "
-        f"{counted(result.views, 'view')}, RMS {result.rms_px:.4f} px"
+        f"than calibrated; {counted(result.views, 'view')}, RMS {result.rms_px:.4f} px"
         + (f", {result.out_of_range} outside the calibrated range" if result.out_of_range else "")
     )
 
