@@ -21,11 +21,14 @@ doi:10.1109/TASSP.1976.1162830)
     var(psi)  ~  integral w^2 psi^2 (S (N + M) + N M)  /  (integral w^2 psi S)^2
 
 A Gaussian of width sigma applied to both images is ``psi = exp(-w^2 sigma^2)``; the best sigma is
-looked up on the radial spectrum.
+looked up on the radial spectrum. S is only known as the difference of what is seen and of the noise, and where it is
+small, chance decides over it: most at high frequencies, which count by w^2. So the smallest integral that the scatter
+of the spectrum allows is what divides.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
@@ -38,11 +41,13 @@ from semcal_ros.core.arrays import AnyImage, Array, Image, Indices
 from semcal_ros.core.registration.thresholds import (
     GAUSSIAN_SIGMAS,
     NOISE_BAND,
+    NOISE_ERROR,
     NOISE_SPECTRUM_PX,
     RICH_PART_PX,
     RICH_PARTS,
     SIGNAL_SIGMAS,
     SMOOTHING_FREQUENCIES,
+    SMOOTHING_SIGMAS,
     SMOOTHINGS_PX,
     SPECTRUM_PX,
     SPECTRUM_RINGS,
@@ -64,11 +69,14 @@ class ImageStatistics:
         Variance of the rest.
     sigma_px
         Width of the Gaussian that minimises the variance of a shift; 0 for none.
+    significance
+        By how many standard errors its gradient is more than that of white noise, at the width where it is most.
     """
 
     noise_variance: float
     signal_variance: float
     sigma_px: float
+    significance: float
 
 
 @lru_cache(maxsize=8)
@@ -100,14 +108,19 @@ def _cut_middle(image: AnyImage, crop_px: int) -> Array:
     return image[top : top + rows, left : left + cols].astype(np.float64)
 
 
-def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array]:
-    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
-    crop = _cut_middle(image, crop_px)
-    window, ring, middle, count = _rings(*crop.shape)
-    crop = (crop - float(np.sum(crop * window) / window.sum())) * window
-    spectrum = scipy.fft.rfft2(crop).ravel()
-    power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
-    total = np.bincount(ring, weights=power, minlength=SPECTRUM_RINGS)
+def _radial_spectrum(images: Sequence[AnyImage]) -> tuple[Array, Array, Array]:
+    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring, of images of one
+    size.
+    """
+    window, ring, middle, count = _rings(images[0].shape[0], images[0].shape[1])
+    total = np.zeros(SPECTRUM_RINGS)
+    for image in images:
+        grey = image.astype(np.float64)
+        crop = (grey - float(np.sum(grey * window) / window.sum())) * window
+        spectrum = scipy.fft.rfft2(crop).ravel()
+        power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
+        total += np.bincount(ring, weights=power, minlength=SPECTRUM_RINGS)
+    count = count * len(images)
     filled = count > 0
     return middle[filled], (total[filled] / count[filled]), count[filled]
 
@@ -144,23 +157,22 @@ def measure_richest_parts(
             chosen.append((y, x))
         if len(chosen) == RICH_PARTS:
             break
+    parts = [np.s_[y : y + RICH_PART_PX, x : x + RICH_PART_PX] for y, x in chosen]
     found = [
-        measure_image(
-            image[y : y + RICH_PART_PX, x : x + RICH_PART_PX],
-            averaged,
-            None if raw is None else raw[y : y + RICH_PART_PX, x : x + RICH_PART_PX],
-        )
-        for y, x in chosen
+        _measure([image[part]], averaged, None if raw is None else [raw[part]]) for part in parts
     ]
-    return ImageStatistics(
-        float(np.median([part.noise_variance for part in found])),
-        float(np.median([part.signal_variance for part in found])),
-        float(np.median([part.sigma_px for part in found])),
-    )
+    # One of them may show something else.
+    noise, signal, sigma, significance = np.median(
+        [(p.noise_variance, p.signal_variance, p.sigma_px, p.significance) for p in found], axis=0
+    ).tolist()
+    return ImageStatistics(noise, signal, sigma, significance)
 
 
 def measure_image(
-    image: AnyImage, averaged: float = 1.0, raw: AnyImage | None = None
+    image: AnyImage,
+    averaged: float = 1.0,
+    raw: AnyImage | None = None,
+    side_px: int = SPECTRUM_PX,
 ) -> ImageStatistics:
     """Noise, signal and the best smoothing of ``image`` (at least 16 x 16 px).
 
@@ -174,28 +186,54 @@ def measure_image(
     raw
         One of these images before it was resampled. Interpolation takes noise away at high frequencies
         and leaves it at lower ones, where the signal is; only the noise of the raw image is white.
+    side_px
+        Largest side of the part that is looked at, from the middle.
 
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; an image with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
-    w, power, count = _radial_spectrum(image, SPECTRUM_PX)
-    noise = _noise_floor(w, power, count)
-    signal = _find_signal(power, noise, count)
-    signal_variance = float(np.sum(signal * count) / np.sum(count))
-    if signal_variance <= 0.0 or noise <= 0.0:
-        return ImageStatistics(noise, signal_variance, 0.0)
-    white = noise
+    return _measure(
+        [_cut_middle(image, side_px)],
+        averaged,
+        None if raw is None else [_cut_middle(raw, side_px)],
+    )
+
+
+def _measure(
+    images: Sequence[AnyImage], averaged: float, raw: Sequence[AnyImage] | None
+) -> ImageStatistics:
+    """What images of one size have in common, as of :func:`measure_image`."""
+    w, power, count = _radial_spectrum(images)
+    white = _noise_floor(w, power, count)
+    corners = float(np.sum(count[w > NOISE_BAND * np.pi]))
+    # The error of the noise is common to all rings.
+    error2 = 2.0 / corners
+    if averaged > 1.0:
+        error2 += NOISE_ERROR**2
     if raw is not None:
-        white = max(noise, _noise_floor(*_radial_spectrum(raw, SPECTRUM_PX)) / averaged)
-        signal = _find_signal(power, white, count)
-        if not np.any(signal):
-            return ImageStatistics(noise, signal_variance, float(SMOOTHINGS_PX[-1]))
+        white = max(white, _noise_floor(*_radial_spectrum(raw)) / averaged)
+    signal_variance = float(np.sum(_find_signal(power, white, count) * count) / np.sum(count))
+    if white <= 0.0:
+        return ImageStatistics(white, signal_variance, 0.0, float("inf"))
+    scatter = np.sqrt(2.0 / count)
+    signal = power - white
+    # Interpolation took noise away where little is left of it: that is no signal below zero.
+    signal = np.where(signal < -SIGNAL_SIGMAS * scatter * white, 0.0, signal)
     psi = np.exp(-np.outer(SMOOTHINGS_PX**2, w**2))
+    steep = count * w**2
+    gradient = psi @ (steep * signal)
+    common = error2 * (psi @ steep * white) ** 2
+    by_chance = np.sqrt(psi**2 @ (steep * scatter * white) ** 2 + common)
+    significance = float(np.max(gradient / by_chance))
+    least = gradient - SMOOTHING_SIGMAS * np.sqrt(psi**2 @ (steep * scatter * power) ** 2 + common)
+    is_known = least > 0.0
+    if not np.any(is_known):
+        return ImageStatistics(white, signal_variance, float(SMOOTHINGS_PX[-1]), significance)
     single = white * averaged
-    numerator = psi**2 @ (count * w**2 * ((white + single) * signal + white * single))
-    denominator = psi @ (count * w**2 * signal)
-    best = int(np.argmin(numerator / denominator**2))
-    return ImageStatistics(noise, signal_variance, float(SMOOTHINGS_PX[best]))
+    noisy = (white + single) * np.maximum(signal, 0.0) + white * single
+    variances = (psi**2 @ (steep * noisy))[is_known] / least[is_known] ** 2
+    best = SMOOTHINGS_PX[is_known][int(np.argmin(variances))]
+    return ImageStatistics(white, signal_variance, float(best), significance)
 
 
 def _find_signal(power: Array, noise: float, count: Array) -> Array:

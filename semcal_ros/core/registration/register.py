@@ -73,16 +73,20 @@ from semcal_ros.core.registration.specimen import (
     refuse_unless_followed,
 )
 from semcal_ros.core.registration.thresholds import (
+    CONTRAST_CHANGE,
     DROPPED_MAX,
     DROPPED_WITHIN_PX,
+    FAINT_SPECTRUM_PX,
     FARTHER_PX,
     GREY_LEVEL_MAX,
     LEVEL_PX_MIN,
+    NOISE_ERROR,
     PARTS_SIGNAL_MIN,
     PULL_PX_MAX,
     SIDE_PX_MIN,
     SIGNAL_MIN,
     SIGNAL_SHARE_MIN,
+    SIGNIFICANCE_MIN,
     SPECIMEN_SHARE_MIN,
     TEXTURE_PX_MIN,
     WEAK_SIGNAL_MIN,
@@ -266,14 +270,19 @@ def prepare_reference(
     if statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance:
         # A sparse specimen need not show anything there; the whole image decides.
         statistics = measure_image(gray, averaged, before)
-    is_sparse = statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance
+    is_sparse = False
     if statistics.signal_variance < WEAK_SIGNAL_MIN * statistics.noise_variance:
         # A few particles are a small part of the variance, and tell a shift as well as many.
         found = measure_richest_parts(gray, averaged, before)
-        if is_sparse and found.signal_variance < PARTS_SIGNAL_MIN * found.noise_variance:
-            return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
+        is_sparse = found.signal_variance > found.noise_variance
+        if statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance:
+            is_sparse = found.signal_variance >= PARTS_SIGNAL_MIN * found.noise_variance
+        if not is_sparse:
+            # What is faint everywhere is told by many pixels.
+            statistics = measure_image(gray, averaged, before, FAINT_SPECTRUM_PX)
+            if statistics.significance < SIGNIFICANCE_MIN:
+                return Reference(inside, coarse, (), 0.0, "featureless (noise only)", limits)
         # Of one or two of them in its middle, chance tells the smoothing as much as they do.
-        is_sparse = is_sparse or found.signal_variance > found.noise_variance
         if is_sparse:
             statistics = replace(found, noise_variance=statistics.noise_variance)
     levels = []
@@ -745,4 +754,9 @@ def _measure_signals(reference: Reference, variance: float, alignment: Alignment
     signal = max(whole - noise, SIGNAL_SHARE_MIN * whole)
     image_signal = max(image_whole - image_noise, SIGNAL_SHARE_MIN * image_whole)
     correlation = alignment.common_covariance / np.sqrt(signal * image_signal)
-    return _Signals(float(min(correlation, 1.0)), float(np.sqrt(image_signal / signal)))
+    # Where the noise is most of what is seen, its error decides over the ratio, and the contrast is rather that before.
+    errors = NOISE_ERROR * np.array([noise / signal, image_noise / image_signal])
+    spread = CONTRAST_CHANGE**2
+    trust = spread / (spread + 0.25 * float(errors @ errors))
+    contrast = (image_signal / signal) ** (0.5 * trust)
+    return _Signals(float(min(correlation, 1.0)), float(contrast))

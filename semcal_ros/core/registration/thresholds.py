@@ -112,11 +112,24 @@ PARTS_SIGNAL_MIN = TABLE.derived(
     "PARTS_SIGNAL_MIN", 0.3, "of the variance of the noise",
     "The same of the richest parts: those of 1550 images of noise, 192 to 768 px, had 0.21 at most.",
 )
+SIGNIFICANCE_MIN = TABLE.derived(
+    "SIGNIFICANCE_MIN", 8.0, "standard errors",
+    "By which the gradient of what is faint everywhere is more than that of white noise. Of 19 000 images of noise of "
+    "48 to 256 px, two have more by chance, both of 64 px and less.",
+)
 SIGNAL_SHARE_MIN = TABLE.measured(
     "SIGNAL_SHARE_MIN", 0.02, "of the whole variance",
     "That the structure has, however large the noise is estimated: the correlation stays finite. 1.5 times as "
     "large or as small, it changes nothing in 20 cases; a thousand times or a thousandth of it does.",
     command=TRIED,
+)
+NOISE_ERROR = TABLE.stated(
+    "NOISE_ERROR", 0.1, "of the variance of the noise",
+    "To which it is known: to 7 % of a single image (NOISE_SPECTRUM_PX), and to less of a mean of shifted ones.",
+)
+CONTRAST_CHANGE = TABLE.stated(
+    "CONTRAST_CHANGE", 0.1, "",
+    "By which the contrast of an image is expected to differ from that of its reference, where noise hides it.",
 )
 FARTHER_PX = TABLE.stated(
     "FARTHER_PX", 8.0, "px",
@@ -558,6 +571,11 @@ SPECTRUM_PX = TABLE.cost(
     "SPECTRUM_PX", 256, "px",
     "Side of the part of an image, from its middle, whose spectrum tells the smoothing.",
 )
+FAINT_SPECTRUM_PX = TABLE.cost(
+    "FAINT_SPECTRUM_PX", 1024, "px",
+    "The same of an image that shows hardly more than noise: of four times the side, a structure is told that has a "
+    "quarter of the variance.",
+)
 NOISE_SPECTRUM_PX = TABLE.cost(
     "NOISE_SPECTRUM_PX", 64, "px",
     "Side of the part whose spectrum tells the noise, to 7 %.",
@@ -594,9 +612,15 @@ SMOOTHING_FREQUENCIES = TABLE.cost(
     "SMOOTHING_FREQUENCIES", 256, "frequencies",
     "Of the spectrum of a smoothing, more than it has taps.",
 )
+SMOOTHING_SIGMAS = TABLE.derived(
+    "SMOOTHING_SIGMAS", 3.0, "standard errors",
+    "By which the gradient that a smoothing leaves may be less than it looks: one in 740 is by chance, of twenty "
+    "smoothings one of which is taken.",
+)
 SIGNAL_SIGMAS = TABLE.derived(
     "SIGNAL_SIGMAS", 2.0, "standard errors",
-    "By which a ring exceeds the noise where it holds signal: one in 44 rings of noise does.",
+    "By which a ring exceeds the noise where it holds signal: one in 44 rings of noise does. As far below it, noise "
+    "was taken away.",
 )
 GAUSSIAN_SIGMAS = TABLE.derived(
     "GAUSSIAN_SIGMAS", 3.5, "sigma",

@@ -543,8 +543,57 @@ def test_noise_that_resampling_has_coloured_is_smoothed_as_white_noise_is() -> N
     told = prepare_reference(first, raw=raw).levels[-1].sigma_px
     # Without what it was before, it seems to have next to no noise, and structure at all frequencies.
     assert prepare_reference(first).levels[-1].sigma_px < 0.6 * white
-    # Widths are in steps of 12 %.
-    assert told == pytest.approx(white, rel=0.15)
+    # The variance of a shift is flat about its least: a width that is 30 % larger costs 3 % of its sigma here.
+    assert told == pytest.approx(white, rel=0.3)
+
+
+def _at_low_dose(electrons: float, seed: int, *, moved: bool = True) -> list[np.ndarray]:
+    """Two pictures of a rough ground with a contrast of 12 %, at so many electrons per px, 1.5 and -1 px apart; of two
+    grounds if they are not ``moved``.
+    """
+    rng = np.random.default_rng(seed)
+    pictures = []
+    for k in (0, 1):
+        if not (k and moved):
+            ground = sum(
+                cv2.GaussianBlur(rng.standard_normal((1024, 1024)), (0, 0), s) * s for s in (2, 6)
+            )
+            ground *= 0.12 / ground.std()
+        # Half pixels by the mean of two neighbours of a picture of twice the size.
+        top, left = (26, 23) if k and moved else (24, 26)
+        seen = cv2.resize(
+            ground[top : top + 976, left : left + 976], None, fx=0.5, fy=0.5, interpolation=3
+        )
+        pictures.append(rng.poisson(electrons * (1.0 + seen)) * (60.0 / electrons))
+    return pictures
+
+
+@pytest.mark.parametrize("electrons", [4.0, 12.0, 40.0])
+def test_a_faint_texture_is_told_by_many_pixels(electrons: float) -> None:
+    """Its variance is 6 % of that of the noise at 4 electrons, and it is not featureless."""
+    z = []
+    for seed in range(4):
+        first, second = _at_low_dose(electrons, seed)
+        found = register_pair(first, second, guess_px=(0.0, 0.0), guess_covariance=4.0 * np.eye(2))
+        assert found.accepted, found.reason
+        z.append((found.shift_px - [1.5, -1.0]) / np.sqrt(np.diag(found.covariance)))
+    # Eight normal deviates have a mean square beyond 2.5 once in 100 times.
+    assert np.mean(np.square(z)) < 2.5
+
+
+def test_two_faint_textures_have_nothing_in_common() -> None:
+    for seed in range(4):
+        for electrons in (4.0, 12.0):
+            assert not register_pair(*_at_low_dose(electrons, seed, moved=False)).accepted
+
+
+def test_the_contrast_of_faint_images_is_not_that_of_their_noise() -> None:
+    """A mean into which frames went with a contrast that chance made has more noise than it is thought to have."""
+    contrasts = [register_pair(*_at_low_dose(4.0, seed)).contrast for seed in range(6)]
+    assert np.std(np.log(contrasts)) < 0.06
+    first, second = _at_low_dose(400.0, 0)
+    # Where they are clear, it is what it is.
+    assert register_pair(first, 0.6 * second).contrast == pytest.approx(0.6, abs=0.02)
 
 
 def test_faint_images_are_compared_with_all_their_pixels() -> None:

@@ -162,5 +162,9 @@ def test_noise_is_seldom_taken_for_structure() -> None:
     # 12 of 600 are stated; four of their standard deviations, 3.4, to either side.
     assert 1 <= np.count_nonzero(signals(600, 96) > t.SIGNAL_MIN) <= 25
     assert signals(60, 192).max() < t.SIGNAL_MIN
+    # Two of 19 000 are stated.
+    assert max(measure_image(rng.normal(size=(96, 96))).significance for _ in range(300)) < (
+        t.SIGNIFICANCE_MIN
+    )
     parts = [measure_richest_parts(rng.normal(size=(192, 192))) for _ in range(60)]
     assert max(p.signal_variance / p.noise_variance for p in parts) < 0.7 * t.PARTS_SIGNAL_MIN
