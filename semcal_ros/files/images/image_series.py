@@ -22,7 +22,6 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import timezone
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -44,13 +43,10 @@ from semcal_ros.files.images.image_file import (
     describe_image_file,
     is_image_file,
 )
+from semcal_ros.files.images.page_stamps import StampedPage, stamp_pages
 from semcal_ros.files.images.sem_image import VendorSettings
 from semcal_ros.text_files import name_similar_file
 
-_SECOND_NS = 1_000_000_000
-_SYNTHETIC_START_NS = 946_684_800 * _SECOND_NS  # 2000-01-01 UTC
-MIN_SPACING_NS = 1_000_000
-"""Least time between two images, whose files have whole seconds: 1000 images fit into one."""
 # What a maker's file and a user say about a pixel may differ in their last digits.
 _SAME_SCALE = 5e-3
 # Files in which a bar of text is looked for.
@@ -180,14 +176,7 @@ class ImageSeries:
                     yield image, error
 
 
-@dataclass(frozen=True)
-class _Image:
-    file: ImageFile
-    page: ImagePage
-    stamp_ns: int
-
-
-def _settings_of(image: _Image) -> Conditions:
+def _settings_of(image: StampedPage) -> Conditions:
     return image.page.settings or Conditions()
 
 
@@ -276,69 +265,7 @@ def _collect(paths: Sequence[Path]) -> tuple[list[ImageFile], list[Skipped]]:
     return found, skipped
 
 
-def _local_ns(file: ImageFile) -> int | None:
-    if file.time is None:
-        return None
-    # Microsoft's and others' epochs before 1970 would be negative.
-    return max(0, round(file.time.replace(tzinfo=timezone.utc).timestamp() * 1e3) * 1_000_000)
-
-
-def _stamp(
-    files: Sequence[ImageFile], frame_interval_s: float | None
-) -> tuple[list[_Image], list[str]]:
-    """Order images by time with strictly increasing stamps; also say where the stamps come from."""
-    begins = [_local_ns(file) for file in files]
-    if frame_interval_s is not None:
-        known = [begin for begin in begins if begin is not None]
-        start_ns = min(known) if len(known) == len(files) else _SYNTHETIC_START_NS
-        pages = [(file, page) for file in _in_time(files, begins) for page in file.pages]
-        step_ns = 1e9 * frame_interval_s
-        return [
-            _Image(file, page, start_ns + round(k * step_ns))
-            for k, (file, page) in enumerate(pages)
-        ], [f"stamps are {frame_interval_s:g} s apart, as given"]
-    several = sum(len(file.pages) for file in files) > 1
-    without = any(begin is None for begin in begins)
-    unspaced = any(page.offset_s is None for file in files for page in file.pages[1:])
-    notes = []
-    if without and several and (unspaced or len(files) > 1):
-        notes.append(
-            f"{'not all files have a time' if any(begins) else 'the files have no times'}: stamps are 1 s apart, "
-            "in the order of names; --frame-interval states the true interval"
-        )
-    elif unspaced:
-        notes.append(
-            "the images of one file are taken to be 1 s apart; --frame-interval states the true interval"
-        )
-    elif without:
-        notes.append("stamps are the times from the first image of the file" if several else "")
-    else:
-        notes.append("stamps are the files' local times taken as UTC")
-    images: list[_Image] = []
-    latest_ns = None
-    for file in files if without else _in_time(files, begins):
-        begin_ns = None if without else _local_ns(file)
-        if begin_ns is None:
-            begin_ns = _SYNTHETIC_START_NS if latest_ns is None else latest_ns + _SECOND_NS
-        for number, page in enumerate(file.pages):
-            offset_s = float(number) if page.offset_s is None else page.offset_s
-            stamp_ns = begin_ns + round(1e9 * offset_s)
-            if latest_ns is not None:
-                # Files have whole seconds; images of the same second stay in the order of their names.
-                stamp_ns = max(stamp_ns, latest_ns + MIN_SPACING_NS)
-            images.append(_Image(file, page, stamp_ns))
-            latest_ns = stamp_ns
-    return images, [note for note in notes if note]
-
-
-def _in_time(files: Sequence[ImageFile], begins: Sequence[int | None]) -> list[ImageFile]:
-    if any(begin is None for begin in begins):
-        return list(files)
-    order = sorted(range(len(files)), key=lambda k: begins[k] or 0)
-    return [files[k] for k in order]
-
-
-def _stages(found: Sequence[_Image]) -> tuple[list[StageReading | None], list[str]]:
+def _stages(found: Sequence[StampedPage]) -> tuple[list[StageReading | None], list[str]]:
     """Return what the files say about the stage, as far as its meaning is known, and notes.
 
     Makers do not say in which sense they count a rotation. One that is the same in all files only adds
@@ -560,7 +487,7 @@ def list_image_series(
         )
     files, unscaled, scale_notes = _scale(found, display_width_m, pixel_size_m, magnification)
     files, detector_notes = _one_detector(files)
-    stamped, stamp_notes = _stamp(files, frame_interval_s)
+    stamped, stamp_notes = stamp_pages(files, frame_interval_s)
     readings, stage_notes = _stages(stamped)
     if not stage:
         readings, stage_notes = [None] * len(stamped), []

@@ -42,12 +42,12 @@ from semcal_ros.files.bags.messages import (
 )
 from semcal_ros.files.bags.writer import BagWriter, check_replaceable
 from semcal_ros.files.images.image_series import (
-    MIN_SPACING_NS,
     ImageSeries,
     SeriesImage,
     Skipped,
     group_skipped,
 )
+from semcal_ros.files.images.page_stamps import MIN_SPACING_NS
 from semcal_ros.files.images.sem_image import SemImage
 from semcal_ros.files.recordings import ENCODINGS, RecordedFiles, open_image_series
 
