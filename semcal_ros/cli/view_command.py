@@ -136,7 +136,7 @@ def _show_recording(
         ended.set()
 
     source = RecordingSource(
-        lambda: open_source(recording, microscope), model, microscope, drift=drift
+        lambda: open_source(recording, microscope, model), model, microscope, drift=drift
     )
     try:
         server = PageServer(source, host, port, token)

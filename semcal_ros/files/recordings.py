@@ -72,6 +72,8 @@ ENCODINGS = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
 
 # The first images of a bag, in which a data bar is looked for until one can be told.
 _AMONG = 30
+# A height that rounding has changed by this is that of the same shape, px.
+_SHAPE_PX = 1.5
 # Beyond these, a unit was forgotten: from a tenth of a picometre, far below an atom, to a metre for
 # the pixel of a photograph; from a photographed wall to what bags accept; from a microsecond, which
 # no raster scan reaches, to the time limit of a configuration's frame.
@@ -291,6 +293,7 @@ class Recording(ABC):
         self._notes: list[str] = []
         self._pass_notes: list[str] = []
         self._rejected: list[RejectedFrame] = []
+        self._expected_px: tuple[int, int] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -341,6 +344,8 @@ class Recording(ABC):
         for frame in self._frames():
             cut = self._cut(replace(frame, image=lines.correct(frame.image)))
             if cut is not None:
+                if count == 0:
+                    self._note_shape(cut.image.shape)
                 count += 1
                 yield cut
         if lines.note:
@@ -358,6 +363,38 @@ class Recording(ABC):
             cut = self._cut(replace(frame, image=lines.correct(frame.image)))
             if cut is not None:
                 yield number, cut
+
+    def expect_size(self, size_px: tuple[int, int]) -> None:
+        """Say of what size (width, height) the images are that a calibration was made of, which these are seen with.
+
+        Images of another shape are noted.
+
+        Raises
+        ------
+        BagError
+            If a region of another size is used: a calibration does not know where in the raster it lies.
+        """
+        if self._roi is not None and self._roi[2:] != size_px:
+            raise BagError(
+                f"a region of {self._roi[2]} x {self._roi[3]} px, with a calibration of images of "
+                f"{size_px[0]} x {size_px[1]} px",
+                expected="whole images, or a calibration that was made of the same region",
+                do="leave --roi out; --mask leaves parts of the images out, and the result can be cropped",
+            )
+        self._expected_px = size_px
+
+    def _note_shape(self, shape: tuple[int, ...]) -> None:
+        """Note an image (h, w) of which a calibration does not know where in the raster it lies."""
+        if self._expected_px is None:
+            return
+        (height, width), (calibrated_width, calibrated_height) = shape[:2], self._expected_px
+        if abs(height - width * calibrated_height / calibrated_width) <= _SHAPE_PX:
+            return
+        self._pass_notes.append(
+            f"images of {width} x {height} px are seen with a calibration of images of {calibrated_width} x "
+            f"{calibrated_height} px: their middles are taken for the same place of the raster, which is wrong if rows "
+            "are missing on one side, as under a data bar"
+        )
 
     def _line_phase(self) -> LinePhaseCorrector:
         scan = self.config.scan

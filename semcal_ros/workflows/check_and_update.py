@@ -266,7 +266,7 @@ def _see(model: Calibration, source: Source, options: CheckOptions) -> _GridReco
         conditions.add(frame.conditions)
         frames[name] = replace(frame, image=frame.image[:0])
 
-    with open_source(source, microscope) as opened:
+    with open_source(source, microscope, model) as opened:
         advance = count_frames(options.on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(
             named_frames(opened, note_frame),

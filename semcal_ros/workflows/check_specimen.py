@@ -203,7 +203,7 @@ def check_specimen(
     chosen = resolve_config(options.config, model)
     images: dict[float, Array32] = {}
     moves: dict[float, _Moves] = {}
-    with open_source(source, chosen) as recording:
+    with open_source(source, chosen, model) as recording:
         advance = count_frames(options.on_progress, "reading", recording.frame_count)
         for frame in recording.frames():
             if frame.magnification not in images:

@@ -142,7 +142,7 @@ def evaluate_recording(
     conditions = ConditionsComparison(model)
     with (
         open_workers(options.dask) as workers,
-        open_source(source, microscope, magnification=options.magnification) as opened,
+        open_source(source, microscope, model, magnification=options.magnification) as opened,
     ):
         advance = count_frames(on_progress, "finding corners", opened.frame_count)
         found, rejected = find_views(

@@ -167,7 +167,7 @@ def read_ladder(
     conditions = ConditionsComparison(calibration, scans_may_turn=True)
     frames: dict[str, RecordedFrame] = {}
     pictures = []
-    with open_source(source, microscope) as opened:
+    with open_source(source, microscope, calibration) as opened:
         advance = count_frames(on_progress, "reading", opened.frame_count)
         for index, frame in enumerate(opened.frames()):
             name = frame.file_name or f"frame {index}"

@@ -180,7 +180,11 @@ def choose_pattern(pattern: str, calibration: Calibration) -> str:
 
 
 def open_source(
-    source: Source, config: MicroscopeConfig, *, magnification: float | None = None
+    source: Source,
+    config: MicroscopeConfig,
+    calibration: Calibration | None = None,
+    *,
+    magnification: float | None = None,
 ) -> Recording:
     """Open a recording, or images in memory as if they were one.
 
@@ -193,18 +197,27 @@ def open_source(
         Where images have no times, they are taken to be a second apart.
     config
         How to read it.
+    calibration
+        The calibration that its images are to be seen with, if any.
     magnification
         As for :func:`~semcal_ros.files.recordings.open_recording`.
 
     Raises
     ------
     BagError
-        If the recording cannot be read.
+        If the recording cannot be read, or only a part of each image is used, for which the calibration was not made.
     InvalidValueError
         If an image in memory cannot be used.
     """
     if isinstance(source, (str, os.PathLike, RecordedFiles)):
-        return open_recording(source, config, magnification=magnification)
+        recording = open_recording(source, config, magnification=magnification)
+        if calibration is not None:
+            try:
+                recording.expect_size(calibration.image_size)
+            except BaseException:
+                recording.close()
+                raise
+        return recording
     if magnification is not None:
         raise InvalidValueError(
             "a magnification stated for images in memory", expected="one beside each image"

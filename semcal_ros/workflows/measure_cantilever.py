@@ -351,7 +351,7 @@ def _read(
     notes: list[str] = []
     conditions = ConditionsComparison(model)
     for source in sources:
-        with open_source(source, microscope, magnification=magnification) as opened:
+        with open_source(source, microscope, model, magnification=magnification) as opened:
             path = opened.path
             advance = count_frames(on_progress, "reading", opened.frame_count)
             for frame in opened.frames():

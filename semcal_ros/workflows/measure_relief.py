@@ -195,7 +195,7 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
     model = resolve_calibration(options.calibration)
     microscope = resolve_config(options.config, model)
     stage = microscope.stage
-    with open_source(source, microscope) as opened:
+    with open_source(source, microscope, model) as opened:
         if opened.frame_count not in (2, 3):
             raise InvalidValueError(
                 f"{counted(opened.frame_count, 'image')} for heights",

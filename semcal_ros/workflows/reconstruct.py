@@ -222,7 +222,7 @@ def reconstruct_ball(source: Source, options: ReconstructOptions) -> Reconstruct
     if height_sigma_m != 0.0:
         check_positive(height_sigma_m, "height_sigma_m =")
     with open_workers(options.dask) as workers:
-        with open_source(source, microscope) as opened:
+        with open_source(source, microscope, model) as opened:
             outside = _track(opened, model, tracker, on_progress)
             notes = list(opened.notes)
             on_progress("reading keyframes", 0, None)

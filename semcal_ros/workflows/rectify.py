@@ -219,7 +219,7 @@ def rectify_recording(source: Source, options: RectifyOptions) -> RectifiedRecor
     extrapolated, count, matched = 0, 0, 0
     with ExitStack() as open_files:
         workers = open_files.enter_context(open_workers(options.dask))
-        opened = open_files.enter_context(open_source(source, microscope))
+        opened = open_files.enter_context(open_source(source, microscope, model))
         write: _Write | None = None
         if kind is not None and target is not None:
             if kind == "bag":

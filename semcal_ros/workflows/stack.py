@@ -543,7 +543,7 @@ def stack_recording(source: Source, options: StackOptions) -> StackResult:
     on_progress = options.on_progress
     with (
         open_workers(options.dask) as workers,
-        open_source(source, microscope, magnification=options.magnification) as opened,
+        open_source(source, microscope, model, magnification=options.magnification) as opened,
     ):
         selection = select_frames(
             opened,

@@ -198,7 +198,7 @@ def track_recording(source: Source, options: DriftOptions) -> DriftTrack:
     live, on_progress = options.live, options.on_progress
     model = resolve_calibration(options.calibration)
     microscope = resolve_config(options.config, model, options.frame_time_s)
-    with open_source(source, microscope) as opened:
+    with open_source(source, microscope, model) as opened:
         stamps_ns, follower = _follow(opened, model, microscope, on_progress)
         on_progress("smoothing", 0, None)
         timed, note = estimate_timing(microscope, follower, model)
@@ -303,7 +303,7 @@ def write_drift_video(
     """
     model, rectifier = resolve_calibration(calibration), Rectifier("linear")
     target = Path(path)
-    with open_source(source, track.config) as opened:
+    with open_source(source, track.config, model) as opened:
         first = next(iter(opened.frames()))
         grey = to_gray(first.image, first.encoding)
         height, width = grey.shape

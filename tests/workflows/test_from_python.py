@@ -31,7 +31,7 @@ from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.records import FitRecord
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.reader import open_bag
-from semcal_ros.files.recordings import open_recording
+from semcal_ros.files.recordings import RecordedFiles, open_recording
 from semcal_ros.synthetic import Drift, drift_plan, preset
 from semcal_ros.synthetic.specimens.cantilever import cantilever_plan
 from semcal_ros.workflows.evaluate import evaluate
@@ -250,6 +250,37 @@ def test_the_pixel_size_is_that_of_the_calibration(frames, tmp_path):
     for given in (calibration, tmp_path / "cal.yaml", str(tmp_path / "cal.yaml")):
         result = stack(frames, calibration=given, drift=False)
         assert result.camera.pixel_size_m == calibration.at(G).rectified.pixel_size_m
+
+
+def _recorded(tmp_path, size, **stated) -> RecordedFiles:
+    """Files of five pictures of a size (width, height) with the scale of 20000x."""
+    width, height = size
+    pictures = np.stack([texture(k, 128)[:height, :width] for k in range(COUNT)])
+    tifffile.imwrite(tmp_path / "s.tif", pictures, photometric="minisblack")
+    return RecordedFiles(tmp_path / "s.tif", 0.12 / G / 128, **stated)
+
+
+def test_a_region_is_refused_with_a_calibration_of_whole_images(tmp_path):
+    """A camera of 96 x 96 px does not know where in the raster another region lies: it would be in its middle."""
+    calibration = make_calibration()
+    region = _recorded(tmp_path, (128, 128), roi=(10, 30, 64, 80))
+    for workflow in (rectify, stack, track_drift):
+        with pytest.raises(BagError, match=r"region of 64 x 80 px, with a .* 96 x 96 px; .*--mask"):
+            workflow(region, calibration=calibration)
+    # A calibration of such a region was made of the same one.
+    same = _recorded(tmp_path, (128, 128), roi=(10, 30, 96, 96))
+    assert len(rectify(same, calibration=calibration, drift=False).frames) == COUNT
+
+
+def test_images_of_another_shape_than_the_calibrated_ones_are_noted(tmp_path):
+    note = "a calibration of images of 96 x 96 px: their middles are taken for the same place"
+    calibration = make_calibration()
+    cut = rectify(
+        _recorded(tmp_path, (128, 128), databar_rows=20), calibration=calibration, drift=False
+    )
+    assert any(note in line for line in cut.notes)
+    whole = rectify(_recorded(tmp_path, (128, 128)), calibration=calibration, drift=False)
+    assert not any("middles" in line for line in whole.notes)
 
 
 @pytest.mark.parametrize(
