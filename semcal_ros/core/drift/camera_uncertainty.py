@@ -20,6 +20,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.drift.thresholds import VISIT_SCALE
 
 # Places of the parameters in ScanCamera.covariance.
 _SCALES, _CENTRE = slice(0, 3), slice(3, 5)
@@ -86,4 +87,23 @@ def zoom_covariance(before: ScanCamera, after: ScanCamera) -> Array:
             camera.ideal_from_sem_jacobian, middle - np.array([camera.px, camera.py])
         )
         covariance += scale_covariance(camera, from_centre, np.zeros(2))[:2, :2]
+    return covariance
+
+
+def visit_scale_variance(before: ScanCamera | None, after: ScanCamera | None) -> float:
+    """Variance of the ratio of the scales of two visits, as fractions of them."""
+    stated = relative_scale_sigma(before) ** 2 + relative_scale_sigma(after) ** 2
+    return max(stated, VISIT_SCALE**2)
+
+
+def visit_stretch_covariance(before: ScanCamera, after: ScanCamera, height_px: float) -> Array:
+    """(2, 2) covariance in m^2 of the shear between the first and the last row of a frame of ``height_px`` that the
+    scales of two visits seem to make: a frame that is taller by a part in 1000 looks like one that moves in y.
+    """
+    covariance = np.zeros((2, 2))
+    for camera in (before, after):
+        factor = height_px * camera.m / after.m
+        rows = np.linalg.solve(camera.ideal_from_sem_jacobian, np.array([0.0, factor]))
+        covariance += scale_covariance(camera, rows, np.zeros(2))[:2, :2]
+        covariance += 0.5 * VISIT_SCALE**2 * np.outer(rows, rows)
     return covariance

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.drift.camera_uncertainty import visit_scale_variance
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.keyframe_store import Candidate
 from semcal_ros.core.drift.measurement import (
@@ -39,6 +40,7 @@ from semcal_ros.core.drift.thresholds import (
     REGISTRATIONS_MAX,
     SHEAR_MAX,
     TURN_LEFT_PX,
+    VISIT_SIGMAS,
 )
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
 from semcal_ros.core.errors import Rejection
@@ -167,6 +169,12 @@ def _register(
     if is_turned:
         px_from_unit = similarity_matrix(appears) @ px_from_unit
     covariance = covariance + state.unseen_covariance(px_from_unit)
+    keyframe = state.keyframes[key]
+    is_other_visit = keyframe.time_s < state.zoomed_s
+    stretch = 0.0
+    if is_other_visit:
+        variance = visit_scale_variance(keyframe.frame.camera, frame.camera)
+        stretch = VISIT_SIGMAS * float(np.sqrt(variance))
     registration = register(
         reference,
         image,
@@ -174,13 +182,13 @@ def _register(
         guess_covariance=px_from_unit @ covariance @ px_from_unit.T,
         image_region=region,
         max_shear_px=SHEAR_MAX * frame.size[1],
+        max_stretch=stretch,
         suspected=state.moving,
         takes_lines=True,
         fixed=fixed,
     )
     if registration.rejection is not None:
         return state, RejectedMatch(registration.rejection, registration)
-    keyframe = state.keyframes[key]
     averaged = np.inf if candidate.rescaled else float(state.keyframes.averaged(key))
     known, similarity = state.similarity.match(
         key, registration, turn, frame, averaged, measures=not candidate.rescaled
@@ -188,7 +196,15 @@ def _register(
     measured = registration
     if is_turned:
         measured = constrain_registration(registration, similarity, appears, frame)
-    measure = make_measurement(key, keyframe.frame, frame, measured, motion, averaged)
+    measure = make_measurement(
+        key,
+        keyframe.frame,
+        frame,
+        measured,
+        motion,
+        averaged,
+        is_other_visit=is_other_visit,
+    )
     drift_filter = state.filter
     if drift_filter.pending == key:
         drift_filter = drift_filter.set_keyframe_noise(keyframe_noise(measure), measure.scan_s)
@@ -235,7 +251,7 @@ def _match_turned(
         return state, before
     if isinstance(before, Match):
         similarity, suggested = similarity.confirm_turn(
-            before.registration, turn, frame, state.filter.state.time_s, state.time_s
+            key, before.registration, turn, frame, state.filter.state.time_s, state.time_s
         )
         state = replace(state, similarity=similarity)
     else:

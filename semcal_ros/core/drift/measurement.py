@@ -24,6 +24,7 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.camera_uncertainty import (
     apparent_zoom_shift,
     relative_scale_sigma,
+    visit_stretch_covariance,
     zoom_covariance,
 )
 from semcal_ros.core.drift.frame import ScanFrame
@@ -66,6 +67,8 @@ def make_measurement(
     registration: Registration,
     removed: Array,
     averaged: float,
+    *,
+    is_other_visit: bool = False,
 ) -> Measure:
     """Measurement from a registration of ``now`` against a keyframe that began with ``before``.
 
@@ -82,6 +85,8 @@ def make_measurement(
     averaged
         Number of frames in the keyframe's mean. Its noise is the keyframe's own and not part of
         the measurement's.
+    is_other_visit
+        Whether the magnification was changed in between, so that the scales differ by what a visit does.
     """
     unit = np.linalg.inv(now.px_from_unit)
     share = averaged / (averaged + 1.0) if np.isfinite(averaged) else 1.0
@@ -99,6 +104,9 @@ def make_measurement(
     shear_floor = SHEAR_FLOOR_PX**2 + (part * distance) ** 2
     floor = np.diag([SHIFT_FLOOR_PX**2] * 2 + [shear_floor] * 2)
     joint = share * registration.alignment.joint_covariance + floor
+    if is_other_visit and before.camera is not None and now.camera is not None:
+        stretch = visit_stretch_covariance(before.camera, now.camera, float(now.size[1]))
+        joint[2:, 2:] += now.px_from_unit @ stretch @ now.px_from_unit.T
     shift = both @ registration.alignment.joint_px + np.append(term_s2 * removed[2:], removed[:2])
     ratio = 1.0
     if before.timing is not None:

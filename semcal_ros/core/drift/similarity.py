@@ -144,11 +144,15 @@ class PlaceKeyframe(Operation):
 
 @dataclass(frozen=True)
 class QuietKeyframe:
-    """Rotation and scale of a keyframe while none was found: a sum of insignificant measurements."""
+    """Rotation and scale of a keyframe while none was found: a sum of insignificant measurements.
+
+    ``visit`` is the variance of its scale against that of the present visit of the magnification; zero in the same one.
+    """
 
     mean: Array
     covariance: Array
     time_s: float
+    visit: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -204,6 +208,17 @@ class SimilarityState:
     def predict(self, time_s: float) -> SimilarityState:
         """Predict until a time."""
         return self if self.filter is None else self._apply(self.filter, Predict(time_s))
+
+    def change_visit(self, variance: float) -> SimilarityState:
+        """Note a change of the magnification, since which all scales are others by a ``variance``: a step, and no
+        beginning of a creep.
+        """
+        if self.filter is None:
+            quiet = {key: replace(known, visit=variance) for key, known in self.quiet.items()}
+            return replace(self, quiet=quiet, suspected=None)
+        spread = np.zeros((MOTION_SIZE, MOTION_SIZE))
+        spread[1, 1] = variance
+        return self._apply(self.filter, Inflate(spread))
 
     def mark_frame(self, time_s: float) -> SimilarityState:
         """Note that the present state is that of a frame."""
@@ -291,7 +306,7 @@ class SimilarityState:
         turn = removed + fit.values[4:]
         covariance = fit.covariance[4:, 4:]
         if self.filter is None:
-            covariance = covariance + _floor(registration, frame)
+            covariance = covariance + _floor(registration, frame) + self._visit_covariance(key)
         expected = self.expected_turn(key)
         if self.filter is None and self.suspected is not None:
             # An accepted frame has shown the beginning of it.
@@ -376,17 +391,22 @@ class SimilarityState:
 
     # -- evidence ---------------------------------------------------------------------------------
 
+    def _visit_covariance(self, key: int) -> Array:
+        """(2, 2) what a keyframe of another visit of its magnification adds, as long as nothing is followed."""
+        return np.diag([0.0, self.quiet[key].visit])
+
     def confirm_turn(
         self,
+        key: int,
         registration: Registration,
         removed: Array,
         frame: ScanFrame,
         time_s: float,
         last_s: float,
     ) -> tuple[SimilarityState, Array | None]:
-        """(2,) rotation and scale that an accepted registration at ``time_s`` and the one before it, at
-        ``last_s``, show in the same sense; None where they do not, or where they are followed already. With what is
-        known now.
+        """(2,) rotation and scale that an accepted registration against keyframe ``key`` at ``time_s`` and the one
+        before it, at ``last_s``, show in the same sense; None where they do not, or where they are followed already.
+        With what is known now.
         """
         if self.filter is not None or not _stands_out(registration.alignment):
             return self, None
@@ -395,6 +415,7 @@ class SimilarityState:
             return self, None
         values = fit.values[4:]
         covariance = fit.covariance[4:, 4:] + _floor(registration, frame)
+        covariance = covariance + self._visit_covariance(key)
         if _mahalanobis(values, covariance) <= INNOVATION_CHI2_MAX:
             return self, None
         before, known = self.suspected, replace(self, suspected=(time_s, values))

@@ -125,6 +125,19 @@ DAMPING = TABLE.cost(
 
 # New keyframes, in new_keyframes.py
 
+ZOOM_MIN = TABLE.stated(
+    "ZOOM_MIN", 1.001, "ratio of scales",
+    "From which a frame is of another visit of a magnification. What makers write differs by less from rounding.",
+)
+VISIT_SCALE = TABLE.stated(
+    "VISIT_SCALE", 1e-3, "of the scale",
+    "Least 1-sigma by which two visits differ, of one magnification or two: a calibration that was made of one visit "
+    "of each does not know how well the microscope comes back.",
+)
+VISIT_SIGMAS = TABLE.derived(
+    "VISIT_SIGMAS", 3.0, "sigma",
+    "Of the scale of a visit, up to which an image that is larger is no other one: one in 370 is beyond by chance.",
+)
 SMALL_ZOOM = TABLE.stated(
     "SMALL_ZOOM", 1.15, "ratio of scales",
     "Up to which the keyframe stays in use, resampled for each frame; beyond, interpolation loses structure, and "

@@ -36,7 +36,7 @@ import numpy as np
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
-from semcal_ros.core.drift.camera_uncertainty import centre_covariance
+from semcal_ros.core.drift.camera_uncertainty import centre_covariance, visit_scale_variance
 from semcal_ros.core.drift.estimates import DriftPredictor, DriftStatus, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import use_match
@@ -63,6 +63,7 @@ from semcal_ros.core.drift.thresholds import (
     STRIPE_CHI2_MIN,
     STRIPE_TRIES,
     VELOCITY_CHANGE,
+    ZOOM_MIN,
 )
 from semcal_ros.core.drift.torn_frames import TearTest
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
@@ -103,7 +104,7 @@ def step(
         state = replace(state, tears=state.tears.look_at(raw))
         state = _look_for_overlay(setup, state, frame)
         frame = state.static.remove_from(frame)
-        state = _predict(setup, state, frame, time_s)
+        state = _note_zoom(_predict(setup, state, frame, time_s), frame)
         before = state
         state, update = _follow(setup, state, frame)
         state, update, frame = _follow_without_stripes(setup, before, raw, (state, update, frame))
@@ -175,6 +176,18 @@ def _predict(
     if reach > 0.0:
         state = state.inflate(inflate_position(np.eye(2) * reach**2))
     return replace(state, late_s=late_s, jump=np.zeros((2, 2)))
+
+
+def _note_zoom(state: TrackerState, frame: ScanFrame) -> TrackerState:
+    """Note that the magnification was changed before the frame, if it was."""
+    before, now = state.camera, frame.camera
+    if before is None or now is None:
+        return state
+    ratio = (now.m * before.width) / (before.m * now.width)
+    if max(ratio, 1.0 / ratio) <= ZOOM_MIN:
+        return state
+    similarity = state.similarity.change_visit(visit_scale_variance(before, now))
+    return replace(state, similarity=similarity, zoomed_s=state.filter.state.time_s)
 
 
 def _follow(

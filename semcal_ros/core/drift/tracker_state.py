@@ -81,6 +81,8 @@ class TrackerState:
         Those of the latest frame.
     sample
         Some of its pixels, by which an image that comes again is recognised.
+    zoomed_s
+        Time of the first frame since the magnification was changed last. Keyframes before are of other visits.
     late_s
         By how much later than its time it may have been taken: an interval where the frame before has the same time.
     outliers
@@ -111,6 +113,7 @@ class TrackerState:
     camera: ScanCamera | None
     time_s: float
     sample: bytes
+    zoomed_s: float = float("-inf")
     late_s: float = 0.0
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import Alignment
@@ -45,6 +46,7 @@ def find_failure(
     alignment: Alignment,
     correlation: float,
     max_shear_px: float,
+    stretch_px: Array | None = None,
 ) -> Rejection[MatchFailure] | None:
     """Return why an alignment must not be used, or None.
 
@@ -61,6 +63,9 @@ def find_failure(
     max_shear_px
         Largest difference between the upper and the lower end of the image that a drift during the
         scan explains, px.
+    stretch_px
+        (2,) by how much another scale may move the right half of the image against the left one, and the lower half
+        against the upper one, px; None for not at all.
     """
     best, worst = np.sqrt(np.maximum(np.linalg.eigvalsh(alignment.covariance), 0.0)).tolist()
     if not worst <= limits.max_sigma_px and best <= limits.max_sigma_px:
@@ -91,6 +96,8 @@ def find_failure(
     if np.all(shear <= max_shear_px):
         # Between the upper and the lower half, only the departure from one line counts.
         allowed[1] += shear
+    if stretch_px is not None:
+        allowed += np.diag(stretch_px)
     if np.any(np.abs(alignment.half_difference_px) > allowed):
         apart = float(np.max(np.abs(alignment.half_difference_px)))
         return Rejection(

@@ -152,11 +152,15 @@ def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: 
 
 
 def find_agreement(
-    tiles: TileStatistics, noise: TileNoise, suspected: Mask | None = None
+    tiles: TileStatistics,
+    noise: TileNoise,
+    suspected: Mask | None = None,
+    stretch_px: float = 0.0,
 ) -> Agreement:
     """Which tiles agree with the shift at which they were compared.
 
-    ``suspected`` (rows, cols) are those where something moved otherwise in the image before.
+    ``suspected`` (rows, cols) are those where something moved otherwise in the image before. ``stretch_px`` is by how
+    much another scale may move the edges against the middle.
     """
     shared, count = shared_pixels(tiles.sigma_px), tiles.pixels
     weights = information_weights(tiles.gradient, count, tiles.sigma_px, noise)
@@ -181,7 +185,9 @@ def find_agreement(
     )
     disagrees = lacks | exceeds
     louder = replace(noise, reference=hidden * noise.reference, image=hidden * noise.image)
-    disagrees = disagrees | _moves(tiles, weights, louder, shared, ~disagrees, suspected)
+    disagrees = disagrees | _moves(
+        tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
+    )
     # By area: a bright tool has more of a gradient than all of the ground.
     # Of a faint structure, no tile tells what it is; all of them count.
     area = weights if np.any(weights > 0.0) else np.ones_like(weights)
@@ -240,6 +246,7 @@ def _moves(
     shared: float,
     counts: Mask,
     suspected: Mask | None,
+    stretch_px: float,
 ) -> Mask:
     """The tiles with a shift of their own, beyond one that changes in proportion over the field.
 
@@ -291,7 +298,8 @@ def _moves(
         left = np.abs(value)
         scatter = max(1.0, 1.4826 * median(left / sigma))
         uncertain = scatter * np.sqrt(float(inverse[1, 1]))
-        if abs(float(terms[1])) > STRETCH_PX_MAX + AGREEMENT_SIGMAS * uncertain:
+        allowed = STRETCH_PX_MAX + stretch_px * (axis == 0)
+        if abs(float(terms[1])) > allowed + AGREEMENT_SIGMAS * uncertain:
             # What changes along a row is no drift: the specimen is strained or turned, and no part of it is a tool.
             return np.ones_like(found)
         found[known] |= left > TILE_SHIFT_PX_MAX + AGREEMENT_SIGMAS * sigma

@@ -368,6 +368,7 @@ def register(
     guess_covariance: ArrayLike | None = None,
     image_region: Region | None = None,
     max_shear_px: float = 0.0,
+    max_stretch: float = 0.0,
     suspected: MovingTiles | None = None,
     takes_lines: bool = False,
     fixed: Mask | None = None,
@@ -388,6 +389,8 @@ def register(
     max_shear_px
         Largest shear that may be due to drift during the scan. Up to it the upper and the lower
         half of the image may disagree in proportion.
+    max_stretch
+        Largest part by which the scales may differ. Up to it the halves of the image may disagree in proportion.
     suspected
         Where something moved apart from the specimen in the image before, and may still do so; None where nothing did.
         It is found without, which takes twice as long, and a slow one later.
@@ -418,6 +421,7 @@ def register(
             guess_covariance=guess_covariance,
             image_region=image_region,
             max_shear_px=max_shear_px,
+            max_stretch=max_stretch,
             suspected=suspected,
         )
         away_px = np.abs(found.shift_px - dropped_at)
@@ -518,6 +522,7 @@ def _register(
     guess_covariance: ArrayLike | None,
     image_region: Region | None,
     max_shear_px: float,
+    max_stretch: float,
     suspected: MovingTiles | None,
     by_defects: bool = False,
 ) -> Registration:
@@ -596,8 +601,11 @@ def _register(
             peak, alignment = _align_at_finest(reference, pyramid, guess, peak, alignment)
     texture = _texture(gray, inside, reference.settings)
     image_noise = estimate_noise_variance(texture)
+    stretch_px = 0.5 * max_stretch * np.array(gray.shape[1::-1], dtype=np.float64)
     # A tile with a defect is no tile that moves.
-    whole = None if repeats or of_parts else look_at_whole(reference, alignment, image_noise)
+    whole = None
+    if not (repeats or of_parts):
+        whole = look_at_whole(reference, alignment, image_noise, float(stretch_px[0]))
     kept = None
     is_part = not repeats and (whole is None or not whole.is_complete)
     if is_part and _has_fine_lattice(reference):
@@ -609,6 +617,7 @@ def _register(
             guess_covariance=guess_covariance,
             image_region=image_region,
             max_shear_px=max_shear_px,
+            max_stretch=max_stretch,
             suspected=suspected,
             by_defects=True,
         )
@@ -616,7 +625,16 @@ def _register(
         if suspected is not None:
             suspected = replace(suspected, corner_px=suspected.corner_px - np.array(inside[:2]))
         kept = keep_specimen(
-            reference, pyramid, alignment, peak, peaks, guess, spread, follow_px, suspected
+            reference,
+            pyramid,
+            alignment,
+            peak,
+            peaks,
+            guess,
+            spread,
+            follow_px,
+            suspected,
+            float(stretch_px[0]),
         )
     if kept is None and isinstance(chosen, Rejection):
         distances = [float(np.hypot(*(np.array(p.shift_px) - guess))) for p in peaks]
@@ -640,7 +658,9 @@ def _register(
         return Registration(unmeasured_alignment(), float("nan"), named, suggested_px=suggested_px)
     signals = _measure_signals(reference, image_noise, alignment)
     correlation = signals.correlation
-    rejection = find_failure(reference.settings, peak, alignment, correlation, max_shear_px)
+    rejection = find_failure(
+        reference.settings, peak, alignment, correlation, max_shear_px, stretch_px
+    )
     if rejection is not None:
         named = _name_deformation(rejection, reference, pyramid)
         if kept is None and named is not rejection:

@@ -71,15 +71,21 @@ class _Hypothesis:
 
 
 def look_at_whole(
-    reference: Reference, alignment: Alignment | Rejection[MatchFailure], image_noise: float
+    reference: Reference,
+    alignment: Alignment | Rejection[MatchFailure],
+    image_noise: float,
+    stretch_px: float = 0.0,
 ) -> Agreement | None:
-    """Which tiles agree with an alignment of the whole image; None where it did not converge."""
+    """Which tiles agree with an alignment of the whole image, whose edges another scale may have moved by
+    ``stretch_px``; None where it did not converge.
+    """
     if isinstance(alignment, Rejection) or not alignment.converged:
         return None
     statistics = alignment.tile_statistics()
     assert statistics is not None
     sigma_px = reference.levels[-1].sigma_px
-    return find_agreement(statistics, TileNoise.of(sigma_px, reference.noise_variance, image_noise))
+    noise = TileNoise.of(sigma_px, reference.noise_variance, image_noise)
+    return find_agreement(statistics, noise, stretch_px=stretch_px)
 
 
 @dataclass(frozen=True)
@@ -115,11 +121,12 @@ def keep_specimen(
     spread: Array | None,
     follow_px: Region | None = None,
     suspected: MovingTiles | None = None,
+    stretch_px: float = 0.0,
 ) -> Kept | None:
     """The alignment of the specimen alone where not all of the image moves with it; None where all does.
 
     What moves as the part ``follow_px`` of the image does is the specimen, if there is such a part; ``suspected`` is
-    where something moved otherwise in the image before.
+    where something moved otherwise in the image before, and ``stretch_px`` by how much another scale may move edges.
     """
     level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
     first = information_weights(
@@ -143,7 +150,7 @@ def keep_specimen(
             for h in found
         ):
             continue
-        judge = _Judge(reference, noise, suspected, np.array(start.shift_px))
+        judge = _Judge(reference, noise, suspected, np.array(start.shift_px), stretch_px)
         tried = align_reweighted(
             level,
             pyramid,
@@ -203,8 +210,9 @@ class _Judge:
         noise: TileNoise,
         suspected: MovingTiles | None,
         shift_px: Array,
+        stretch_px: float,
     ) -> None:
-        level, self._noise = reference.levels[-1], noise
+        level, self._noise, self._stretch_px = reference.levels[-1], noise, stretch_px
         self.latest: Agreement | None = None
         self._suspected: Mask | None = None
         #: Of the tiles that were compared last.
@@ -230,7 +238,7 @@ class _Judge:
         self.suspected = (
             None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
         )
-        self.latest = find_agreement(tiles, self._noise, self.suspected)
+        self.latest = find_agreement(tiles, self._noise, self.suspected, self._stretch_px)
         return self.latest.weights
 
     @property

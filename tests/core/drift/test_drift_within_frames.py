@@ -25,6 +25,7 @@ import pytest
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.synthetic import Detector, Drift, GoldOnCarbon, Pose, preset, render_frame
@@ -154,6 +155,37 @@ def test_drift_is_right_while_every_frame_zooms() -> None:
         error = (update.drift_m - truth) * camera.m
         scores.append(error / np.maximum(np.sqrt(np.diag(update.covariance)[:2]) * camera.m, 0.01))
     assert np.max(np.abs(scores)) < 4.0
+
+
+@pytest.mark.parametrize("scales", [(0.0, 1e-3, 1.5e-3, -1e-3), (-1e-3, 8e-4, 5e-4, 1.2e-3)])
+@pytest.mark.parametrize("follows_scale", [False, True])
+def test_a_scale_that_comes_back_to_a_part_in_1000_is_no_drift(
+    scales: tuple[float, ...], follows_scale: bool
+) -> None:
+    """A frame that is taller by a part in 1000 is no drift in y, and another visit is no creep of the scale."""
+    timing = ScanTiming(4.0, 1, 0.1)
+    drift = Drift(velocity_m_s=(20e-9, -12e-9))
+    history = DriftHistory()
+    tracker = DriftTracker(DriftSettings(similarity=follows_scale), history=history)
+    zero = drift(np.array([timing.centre_offset_s]))[0]
+    truths, updates, cameras = [], [], []
+    for k, (g, scale) in enumerate(
+        zip(np.repeat([2000.0, 3300.0] * 2, 3), np.repeat(scales, 3), strict=True)
+    ):
+        image, _ = frame_of(float(g * (1.0 + scale)), timing, drift, 5.0 * k, k)
+        camera = MICROSCOPE.with_timing(timing).camera_at(float(g))
+        updates.append(tracker.update(image, 5.0 * k, camera, timing))
+        truths.append(drift(np.array([5.0 * k + timing.centre_offset_s]))[0] - zero)
+        cameras.append(camera)
+    assert [u.status_text for u in updates if not u.accepted] == []
+    path = history.smooth()
+    for k, camera in enumerate(cameras[1:], 1):
+        for found in (updates[k], path[k]):
+            # The true scale is not that of the camera, which moves what has drifted by as much.
+            error_px = (found.drift_m - truths[k]) * camera.m
+            sigma_px = np.sqrt(np.diag(found.covariance)[:2]) * camera.m
+            assert np.all(np.abs(error_px) < 4.0 * np.hypot(sigma_px, 0.01)), (k, error_px)
+            assert np.max(sigma_px) < 0.2
 
 
 @pytest.mark.parametrize("ratio", [1.02, 1.5])

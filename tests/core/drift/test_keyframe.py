@@ -32,6 +32,8 @@ from semcal_ros.core.drift.camera_uncertainty import (
     centre_covariance,
     relative_scale_sigma,
     scale_covariance,
+    visit_scale_variance,
+    visit_stretch_covariance,
     zoom_covariance,
 )
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
@@ -43,6 +45,7 @@ from semcal_ros.core.drift.keyframe import (
 )
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.state import DriftState, initial_state
+from semcal_ros.core.drift.thresholds import VISIT_SCALE
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.fractional_delay import FINE
 from semcal_ros.core.registration.inverse_compositional import unmeasured_alignment
@@ -530,3 +533,21 @@ def test_errors_of_both_scales_move_what_lies_away_from_the_principal_point() ->
         way = np.linalg.solve(camera.ideal_from_sem_jacobian, [95.5 - 60.0, 95.5 - 140.0])
         expected += 0.01**2 * np.outer(way, way)
     np.testing.assert_allclose(zoom_covariance(*cameras), expected, rtol=1e-9)
+
+
+def test_a_scale_that_is_wrong_by_one_per_cent_makes_a_frame_one_per_cent_taller() -> None:
+    cameras = []
+    for magnification in (2000.0, 3400.0):
+        camera = small_camera(magnification)
+        covariance = np.zeros((10, 10))
+        covariance[0, 0] = (0.01 * camera.m) ** 2
+        cameras.append(replace(camera, covariance=covariance))
+    before, now = cameras
+    in_px = now.ideal_from_sem_jacobian
+    seen = in_px @ visit_stretch_covariance(before, now, 200.0) @ in_px.T
+    # Of both scales, and of what no two visits have in common.
+    expected = np.sqrt(2.0 * 0.01**2 + VISIT_SCALE**2) * 200.0
+    assert np.sqrt(seen[1, 1]) == pytest.approx(expected, rel=1e-6)
+    assert abs(seen[0, 0]) < 1e-6 * seen[1, 1]
+    assert visit_scale_variance(before, now) == pytest.approx(2.0 * 0.01**2)
+    assert visit_scale_variance(None, None) == VISIT_SCALE**2
