@@ -30,7 +30,7 @@ from semcal_ros.core.calibration.options import CalibrationOptions, MethodOption
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from semcal_ros.synthetic import preset
-from semcal_ros.synthetic.stage import grid_views
+from semcal_ros.synthetic.stage import SimulatedStage, grid_views, stage_views
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, CALIBRATED_EVENLY, NOISE_PX, calibrated
 from tests.helpers.long_tests import long_but
 
@@ -215,3 +215,23 @@ def test_a_wrong_scale_is_seen_beside_the_reprojection_error(joint, wrong):
         assert abs(error.relative - truth) < 3.0 * error.sigma
         # A third of a per cent: a wrong one of 1 % is significant.
         assert error.sigma < 0.0035
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("miss_m", [(1.6e-4, 0.0), (-1.2e-4, 1e-4)])
+def test_a_tilt_axis_that_misses_the_specimen_is_no_wrong_scale(joint, miss_m):
+    """It moves all tilted views by heights that have little to do with what is usual of one."""
+    microscope = preset("jsm820")
+    stage = SimulatedStage(tilts_rad=(0.17, 0.7), miss_m=miss_m)
+    scores = []
+    for seed in range(3):
+        views = stage_views(microscope.camera_at, BETWEEN, stage, seed=seed)
+        poses = fit_poses(views, joint.model.at, height_sigma_m=1e-5)
+        found = compare_scales(views, joint.model.at, poses, height_sigma_m=1e-5)
+        for g, error in found.items():
+            truth = (
+                joint.model.at(g).pixel_size_m[0] / microscope.camera_at(g).pixel_size_m[0] - 1.0
+            )
+            scores.append((error.relative - truth) / error.sigma)
+            assert error.sigma < 0.01
+    assert np.max(np.abs(scores)) < 3.0

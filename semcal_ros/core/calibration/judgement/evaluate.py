@@ -14,7 +14,7 @@
 
 """Errors of views of a grid under known cameras: poses are fitted, cameras are not.
 
-This is the only figure by which calibrations are compared (design section 6.6): single parameters
+This is the only figure by which calibrations are compared: single parameters
 trade off against each other and against the poses.
 """
 
@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Indices
-from semcal_ros.core.calibration.estimator.blocks import Problem, State, make_problem
+from semcal_ros.core.calibration.estimator.blocks import MISS_NAMES, Problem, State, make_problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, refine
 from semcal_ros.core.calibration.estimator.poses import pose_from_camera
 from semcal_ros.core.calibration.estimator.problem import Priors
@@ -130,9 +130,12 @@ def compare_scales(
     magnifications, cameras, corrected = _without_fields(views, camera_at)
     count = len(magnifications)
     known = np.stack([c.all_parameters for c in cameras])
-    designs = np.zeros((*known.shape, 1 + count))
-    designs[:, :, 0] = known
+    size, shared = known.shape[1], len(MISS_NAMES)
+    designs = np.zeros((count, size + shared, 1 + count + shared))
+    designs[:, :size, 0] = known
     designs[np.arange(count), 0, 1 + np.arange(count)] = [c.m for c in cameras]
+    # A tilt axis that misses the specimen makes heights of tilts, which are alike in all views.
+    designs[:, size:, 1 + count :] = np.eye(shared)
     problem = make_problem(
         corrected,
         magnifications,
@@ -140,12 +143,18 @@ def compare_scales(
         parameters=ALL_NAMES,
         raster=cameras[0].raster,
         nominal_px_per_m=np.array([c.m for c in cameras]),
-        prior_mean=np.append(1.0, np.zeros(count)),
-        prior_sigma=np.append(HELD_SIGMA, np.full(count, FREE_CHANGE)),
+        prior_mean=np.append(1.0, np.zeros(count + shared)),
+        prior_sigma=np.concatenate(
+            [
+                [HELD_SIGMA],
+                np.full(count, FREE_CHANGE),
+                np.full(shared, Priors().axis_miss_sigma_m),
+            ]
+        ),
         height_sigma_m=height_sigma_m,
     )
-    problem = _hold_lines_flat(problem)
-    theta = np.append(1.0, np.zeros(count))
+    problem = _hold_lines_flat(replace(problem, shared=MISS_NAMES))
+    theta = np.append(1.0, np.zeros(count + shared))
     result = refine(problem, State(theta, poses.rotations, poses.translations_m))
     own = np.concatenate([v.sigma_px for v in views])
     # Corners that scatter more than they say make the scale as much less certain.
