@@ -24,6 +24,8 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import numpy as np
+
 from semcal_ros.bridge.fields import absolute_namespace
 from semcal_ros.calibration import Calibration
 from semcal_ros.config.config import MicroscopeConfig
@@ -217,6 +219,7 @@ def rectify_recording(source: Source, options: RectifyOptions) -> RectifiedRecor
     conditions = ConditionsComparison(model)
     states: Counter[str] = Counter()
     extrapolated, count, matched = 0, 0, 0
+    first_note = ""
     with ExitStack() as open_files:
         workers = open_files.enter_context(open_workers(options.dask))
         opened = open_files.enter_context(open_source(source, microscope, model))
@@ -244,6 +247,8 @@ def rectify_recording(source: Source, options: RectifyOptions) -> RectifiedRecor
             if update is not None:
                 states[update.kind] += 1
                 matched += update.accepted
+                if matched == 2 and not first_note:
+                    first_note = _note_first(update, microscope)
             if write is None:
                 frames.append(RectifiedFrame(image, frame.stamp_ns, camera.rectified, update))
             else:
@@ -252,6 +257,7 @@ def rectify_recording(source: Source, options: RectifyOptions) -> RectifiedRecor
             advance(1)
         on_progress("finishing", 0, None)
         notes = (*opened.notes, *conditions.notes, *_note_timing(microscope, follower, model))
+        notes = (*notes, first_note) if first_note else notes
     kinds = dict(states.most_common())
     return RectifiedRecording(
         count, target, tuple(frames), kinds, extrapolated, notes, followed=matched > 1
@@ -285,6 +291,9 @@ def _choose_kind(output: str | os.PathLike[str], scale_bar: bool) -> str:
         )
     return "bag"
 
+
+# Stated: shear of the first frame that is worth a note, px.
+_SHEAR_NOTED_PX = 0.3
 
 # What a bag is not called by mistake: its files, and what other commands write.
 _OTHER_SUFFIXES = (*TABLE_SUFFIXES, ".mcap", ".db3", ".yaml", ".json", ".html", ".svg", ".pdf")
@@ -391,6 +400,23 @@ def _follow(
             time_s = start_time_s(frame, first_ns, microscope)
             update = follower.update(frame, time_s, camera, microscope.scan)
         yield _Followed(frame, camera, update)
+
+
+def _note_first(second: DriftUpdate, microscope: MicroscopeConfig) -> str:
+    """Return a note that the drift within the first frame, of which nothing was known, is left in; the second one tells
+    it.
+    """
+    if microscope.scan is None:
+        return ""
+    in_px, pass_s = second.px_from_unit, microscope.scan.frame_time_s
+    shear_px = np.abs(in_px @ second.velocity_m_s) * pass_s
+    sigma_px = np.sqrt(np.diag(in_px @ second.covariance[2:, 2:] @ in_px.T)) * pass_s
+    if not np.any(shear_px > _SHEAR_NOTED_PX + 2.0 * sigma_px):
+        return ""
+    return (
+        "the drift within the first frame is left in, since nothing is known of it when the frame arrives: about "
+        f"{float(np.max(shear_px)):.1f} px from its first to its last line"
+    )
 
 
 def _note_timing(

@@ -29,6 +29,7 @@ from semcal_ros import calibrate, measure_cantilever, reconstruct, rectify, stac
 from semcal_ros.bridge.projection import stamped_projection_from_message
 from semcal_ros.config.config import load_config
 from semcal_ros.core.camera.records import FitRecord
+from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.bags.reader import open_bag
 from semcal_ros.files.recordings import RecordedFiles, open_recording
@@ -199,6 +200,26 @@ def test_outputs_are_refused_before_any_work(frames, tmp_path):
     with pytest.raises(InvalidValueError, match="32FC1"):
         stack(floats, output=tmp_path / "m.png", on_progress=lambda *a: stages.append(a))
     assert stages[-1][1] <= 1 and not list(tmp_path.iterdir())
+
+
+def test_the_drift_within_the_first_frame_is_said_to_be_left_in():
+    timing = ScanTiming(2.0, 1, 0.1)
+    scope = preset("ideal").with_image_size(SIZE, SIZE).with_timing(timing)
+
+    def notes(speed_m_s: float) -> str:
+        plan = drift_plan(
+            scope,
+            magnification=G,
+            frames=4,
+            interval_s=2.5,
+            drift=Drift(velocity_m_s=(speed_m_s, 0.0)),
+        )
+        seen = [(plan.render(k), G, 2.5 * k) for k in range(4)]
+        done = rectify(seen, calibration=make_calibration(), config="virtual_sem", frame_time_s=2.0)
+        return " ".join(done.notes)
+
+    assert "the drift within the first frame is left in" in notes(40e-9)
+    assert "first frame" not in notes(1e-9)
 
 
 def test_rectified_frames_in_memory_are_those_of_the_bag(frames, tmp_path):

@@ -87,7 +87,10 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
         return LinePhase(0.0, np.inf)
     step = 2 * max(1, height // 2 // LINES_COMPARED)
     first = np.arange(1, height - 1, step)
-    line, above, below = (_prepare(image[first + k]) for k in (0, -1, 1))
+    compared = [image[first + k] for k in (0, -1, 1)]
+    if not all(np.all(np.isfinite(lines)) for lines in compared):
+        return LinePhase(0.0, np.inf)
+    line, above, below = (_prepare(lines) for lines in compared)
     mean = 0.5 * (above + below)
     window = np.hanning(width + 2)[1:-1].astype(np.float32)
     spectrum, other = np.fft.rfft(line * window), np.fft.rfft(mean * window)

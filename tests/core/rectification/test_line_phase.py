@@ -26,6 +26,7 @@ from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.rectification.line_phase import (
+    LinePhase,
     LinePhaseCorrector,
     estimate_line_phase,
     remove_line_phase,
@@ -154,3 +155,10 @@ def test_an_undeclared_phase_is_said_and_left() -> None:
     quiet = LinePhaseCorrector(False)
     quiet.correct(noisy_scene("gold"))
     assert quiet.note == ""
+
+
+def test_infinite_pixels_tell_no_phase() -> None:
+    image = np.random.default_rng(0).normal(size=(64, 96)).astype(np.float32)
+    image[::3, ::5] = np.inf
+    image[1::3, 2::5] = np.nan
+    assert estimate_line_phase(image) == LinePhase(0.0, np.inf)
