@@ -173,6 +173,11 @@ def fractal(rng: Rng) -> Floats:
     return _spectrum(rng, lambda f: f**-2.0 * np.exp(-((f / 0.2) ** 2)))
 
 
+def faint(rng: Rng) -> Floats:
+    """A rough ground whose deviation is 12 % of its brightness."""
+    return 0.5 + 0.35 * (fractal(rng) - 0.5)
+
+
 def fine(rng: Rng) -> Floats:
     return _spectrum(rng, lambda f: np.exp(-((f / 0.12) ** 2)))
 
@@ -365,6 +370,9 @@ class Kind:
 KINDS: dict[str, Kind] = {
     "gold": Kind(gold),
     "gold at 2 electrons": Kind(gold, electrons=8.0),
+    "sparse at 3 electrons": Kind(sparse, electrons=15.0),
+    "faint ground at 4 electrons": Kind(faint, electrons=8.0),
+    "tool over faint ground": Kind(faint, tool, electrons=16.0),
     "charging gold": Kind(gold, charging),
     "gold and a stage move": Kind(gold, jump_px=60.0),
     "gold and a move within a frame": Kind(gold, jump_px=60.0, jump_line=0.3),
