@@ -275,6 +275,27 @@ def name_rejected(rejected: Sequence[RejectedView]) -> list[str]:
     return texts
 
 
+def _without_copies(found: Sequence[FoundView]) -> tuple[list[FoundView], list[RejectedView]]:
+    """Return the views of different images, and those of images that came again.
+
+    Noise never comes twice: what has all points at the same place to the last bit is the same image, and no new view.
+    """
+    firsts: dict[tuple[float, bytes], FoundView] = {}
+    kept, copies = [], []
+    for view in found:
+        first = firsts.setdefault((view.magnification, view.detection.xy.tobytes()), view)
+        if first is view:
+            kept.append(view)
+            continue
+        reason = f"the same image as {first.file_name or first.name}, and no new view"
+        copies.append(
+            RejectedView(
+                view.name, view.magnification, Rejection(ViewStatus.COPY, reason), view.image
+            )
+        )
+    return kept, copies
+
+
 def collect_views(
     found: Sequence[FoundView],
     rejected: Sequence[RejectedView],
@@ -332,6 +353,7 @@ def collect_views(
         for v in found
         if v.detection.image_size != image_size
     ]
+    same, copies = _without_copies(same)
     views, assignment = _assign_squares(same, display_width_m, squares_m)
     # At a single magnification only heights differ, and those of a photographed board may differ by much.
     judged = len({v.magnification for v in same}) > 1
@@ -350,9 +372,9 @@ def collect_views(
         )
     if odd:
         same = [v for v, misfit in zip(same, misfits, strict=True) if not misfit]
-        views, assignment = _assign_squares(same, display_width_m, squares_m)
+    views, assignment = _assign_squares(same, display_width_m, squares_m)
     return CollectedViews(
-        views, tuple(same), (*rejected, *misread, *other, *odd), assignment, image_size
+        views, tuple(same), (*rejected, *misread, *other, *copies, *odd), assignment, image_size
     )
 
 

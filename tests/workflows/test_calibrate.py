@@ -453,3 +453,14 @@ def test_the_reference_recording_with_a_stage(reference_data, monkeypatch):
     assert all(v.stage is not None and v.stage.tilt_rad is not None for v in views)
     assert sorted({v.visit for v in views}) == list(range(20))
     assert done.notes == ()
+
+
+def test_a_copy_of_a_picture_is_no_new_view(dots):
+    frames, _, _ = dots
+    again = [*frames, ("copy", frames[1][1].copy(), frames[1][2])]
+    found, rejected = find_views(again, processes=1)
+    collected = collect_views(found, rejected, display_width_m=0.12, squares_m=[1e-5])
+    assert [v.name for v in collected.found] == ["0", "1", "2"]
+    assert [(r.name, r.reason) for r in collected.rejected] == [
+        ("copy", "the same image as 1, and no new view")
+    ]

@@ -208,6 +208,7 @@ class ViewStatus(Enum):
 
     OTHER_IMAGE_SIZE = "other image size"
     UNKNOWN_SQUARES = "squares of no known size"
+    COPY = "copy of another image"
     OUTLIER = "outlier"
 
 

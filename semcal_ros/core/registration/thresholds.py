@@ -128,7 +128,7 @@ NOISE_ERROR = TABLE.stated(
     "To which it is known: to 7 % of a single image (NOISE_SPECTRUM_PX), and to less of a mean of shifted ones.",
 )
 CONTRAST_CHANGE = TABLE.stated(
-    "CONTRAST_CHANGE", 0.1, "",
+    "CONTRAST_CHANGE", 0.1, "of the contrast",
     "By which the contrast of an image is expected to differ from that of its reference, where noise hides it.",
 )
 FARTHER_PX = TABLE.stated(
