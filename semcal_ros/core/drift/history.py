@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
@@ -28,6 +28,7 @@ from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.similarity import SimilarityEstimate, SimilarityState, turn_drift
 from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import DriftState
+from semcal_ros.core.drift.thresholds import INNOVATION_CHI2_MAX
 from semcal_ros.core.errors import InvalidValueError
 
 
@@ -103,6 +104,9 @@ class DriftHistory:
                     updates.append(update)
                     continue
                 smoothed = _smoothed(update, state, turn, camera)
+                if _contradicts(update, smoothed):
+                    updates.append(update)
+                    continue
                 smoothed.covariance[:2, :2] += update.unseen + doubts[k]
                 if update.time_s > first_s:
                     smoothed.covariance[:2, :2] += process_noise.flicker_covariance
@@ -127,6 +131,21 @@ def _find_doubts(stretch: list[DriftUpdate]) -> list[Array]:
         rests_on_itself = update.accepted and not update.restarted
         doubts.append(update.doubt if rests_on_itself or after is None else after)
     return doubts[::-1]
+
+
+def _contradicts(update: DriftUpdate, smoothed: DriftUpdate) -> bool:
+    """Whether hindsight says something else than the frame did: of two estimates of one thing, the one that rests on
+    more differs from the other by no more than that is uncertain (Hausman 1978, doi:10.2307/1913827).
+
+    It does so where stamps are wrong: of two frames a millisecond apart by their stamps, which were taken a second
+    apart, the path goes through the middle. It may also lose the digits of a velocity that is not known at all.
+    """
+    if np.any(np.diag(smoothed.covariance) < 0.0):
+        return True
+    apart, covariance = smoothed.drift_m - update.drift_m, update.covariance[:2, :2]
+    if not (update.accepted and np.all(np.isfinite(covariance)) and np.any(covariance)):
+        return False
+    return float(apart @ solve_scaled(covariance, apart)) > INNOVATION_CHI2_MAX
 
 
 def _smoothed(

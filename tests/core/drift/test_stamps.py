@@ -148,3 +148,24 @@ def test_to_begin_late_or_to_be_reset_is_no_restart() -> None:
     updates.append(tracker.update(frame(1), 0.0))
     assert [u.accepted for u in updates] == [False, False, True, True]
     assert not any(u.restarted for u in updates)
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 0.2, 0.35, 0.6])
+@pytest.mark.parametrize("interval_s", [0.5, 0.7])
+def test_hindsight_that_contradicts_the_frames_is_not_believed(
+    begin_s: float, interval_s: float
+) -> None:
+    """Frames that share a second are stamped a millisecond apart, as by a driver whose frames come in bursts."""
+    times: list[float] = []
+    for k in range(24):
+        second = float(np.floor(begin_s + interval_s * k))
+        times.append(second if not times or second > times[-1] else times[-1] + 1e-3)
+    step_px = 2.0 * STEP_PX
+    updates, path = track(times, step_px)
+    for found in (updates, list(path)[1:]):
+        used = [u for u in found if u.accepted and u is not updates[0]]
+        assert len(used) > 12
+    for k, update in enumerate(path):
+        if k and update.accepted:
+            assert np.all(np.abs(update.drift_px - k * step_px) < 4.0 * update.sigma_px)
+    assert np.all(np.diagonal(path.covariance[1:], axis1=1, axis2=2) >= 0.0)
