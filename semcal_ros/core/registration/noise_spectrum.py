@@ -28,7 +28,6 @@ of the spectrum allows is what divides.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
@@ -108,19 +107,14 @@ def _cut_middle(image: AnyImage, crop_px: int) -> Array:
     return image[top : top + rows, left : left + cols].astype(np.float64)
 
 
-def _radial_spectrum(images: Sequence[AnyImage]) -> tuple[Array, Array, Array]:
-    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring, of images of one
-    size.
-    """
-    window, ring, middle, count = _rings(images[0].shape[0], images[0].shape[1])
-    total = np.zeros(SPECTRUM_RINGS)
-    for image in images:
-        grey = image.astype(np.float64)
-        crop = (grey - float(np.sum(grey * window) / window.sum())) * window
-        spectrum = scipy.fft.rfft2(crop).ravel()
-        power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
-        total += np.bincount(ring, weights=power, minlength=SPECTRUM_RINGS)
-    count = count * len(images)
+def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array]:
+    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
+    crop = _cut_middle(image, crop_px)
+    window, ring, middle, count = _rings(*crop.shape)
+    crop = (crop - float(np.sum(crop * window) / window.sum())) * window
+    spectrum = scipy.fft.rfft2(crop).ravel()
+    power = (spectrum.real**2 + spectrum.imag**2) / float(np.sum(window**2))
+    total = np.bincount(ring, weights=power, minlength=SPECTRUM_RINGS)
     filled = count > 0
     return middle[filled], (total[filled] / count[filled]), count[filled]
 
@@ -159,7 +153,7 @@ def measure_richest_parts(
             break
     parts = [np.s_[y : y + RICH_PART_PX, x : x + RICH_PART_PX] for y, x in chosen]
     found = [
-        _measure([image[part]], averaged, None if raw is None else [raw[part]]) for part in parts
+        measure_image(image[part], averaged, None if raw is None else raw[part]) for part in parts
     ]
     # One of them may show something else.
     noise, signal, sigma, significance = np.median(
@@ -192,18 +186,7 @@ def measure_image(
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; an image with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
-    return _measure(
-        [_cut_middle(image, side_px)],
-        averaged,
-        None if raw is None else [_cut_middle(raw, side_px)],
-    )
-
-
-def _measure(
-    images: Sequence[AnyImage], averaged: float, raw: Sequence[AnyImage] | None
-) -> ImageStatistics:
-    """What images of one size have in common, as of :func:`measure_image`."""
-    w, power, count = _radial_spectrum(images)
+    w, power, count = _radial_spectrum(image, side_px)
     white = _noise_floor(w, power, count)
     corners = float(np.sum(count[w > NOISE_BAND * np.pi]))
     # The error of the noise is common to all rings.
@@ -211,7 +194,7 @@ def _measure(
     if averaged > 1.0:
         error2 += NOISE_ERROR**2
     if raw is not None:
-        white = max(white, _noise_floor(*_radial_spectrum(raw)) / averaged)
+        white = max(white, _noise_floor(*_radial_spectrum(raw, side_px)) / averaged)
     signal_variance = float(np.sum(_find_signal(power, white, count) * count) / np.sum(count))
     if white <= 0.0:
         return ImageStatistics(white, signal_variance, 0.0, float("inf"))
