@@ -104,7 +104,7 @@ class Agreement:
     disagrees
         (rows, cols) the tiles that show something else.
     share
-        Part of the compared tiles with structure that agrees; of all of them where none tells its structure from noise.
+        Part of the compared tiles with structure that agrees.
     pull
         Part of all gradients that does not, and would pull the shift.
     informs
@@ -189,9 +189,7 @@ def find_agreement(
         tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
     )
     # By area: a bright tool has more of a gradient than all of the ground.
-    # Of a faint structure, no tile tells what it is; all of them count.
-    area = weights if np.any(weights > 0.0) else np.ones_like(weights)
-    share = float(area[~disagrees].sum() / area.sum())
+    share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
     body = fill_bodies(keep_bodies(disagrees, BODY_TILES_MIN))
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)

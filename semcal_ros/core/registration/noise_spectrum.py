@@ -187,17 +187,17 @@ def measure_image(
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
     w, power, count = _radial_spectrum(image, side_px)
-    white = _noise_floor(w, power, count)
+    noise = white = _noise_floor(w, power, count)
     corners = float(np.sum(count[w > NOISE_BAND * np.pi]))
     # The error of the noise is common to all rings.
     error2 = 2.0 / corners
     if averaged > 1.0:
         error2 += NOISE_ERROR**2
     if raw is not None:
-        white = max(white, _noise_floor(*_radial_spectrum(raw, side_px)) / averaged)
+        white = max(noise, _noise_floor(*_radial_spectrum(raw, side_px)) / averaged)
     signal_variance = float(np.sum(_find_signal(power, white, count) * count) / np.sum(count))
     if white <= 0.0:
-        return ImageStatistics(white, signal_variance, 0.0, float("inf"))
+        return ImageStatistics(noise, signal_variance, 0.0, float("inf"))
     scatter = np.sqrt(2.0 / count)
     signal = power - white
     # Interpolation took noise away where little is left of it: that is no signal below zero.
@@ -211,12 +211,12 @@ def measure_image(
     least = gradient - SMOOTHING_SIGMAS * np.sqrt(psi**2 @ (steep * scatter * power) ** 2 + common)
     is_known = least > 0.0
     if not np.any(is_known):
-        return ImageStatistics(white, signal_variance, float(SMOOTHINGS_PX[-1]), significance)
+        return ImageStatistics(noise, signal_variance, float(SMOOTHINGS_PX[-1]), significance)
     single = white * averaged
     noisy = (white + single) * np.maximum(signal, 0.0) + white * single
     variances = (psi**2 @ (steep * noisy))[is_known] / least[is_known] ** 2
     best = SMOOTHINGS_PX[is_known][int(np.argmin(variances))]
-    return ImageStatistics(white, signal_variance, float(best), significance)
+    return ImageStatistics(noise, signal_variance, float(best), significance)
 
 
 def _find_signal(power: Array, noise: float, count: Array) -> Array:

@@ -85,7 +85,11 @@ def look_at_whole(
     assert statistics is not None
     sigma_px = reference.levels[-1].sigma_px
     noise = TileNoise.of(sigma_px, reference.noise_variance, image_noise)
-    return find_agreement(statistics, noise, stretch_px=stretch_px)
+    found = find_agreement(statistics, noise, stretch_px=stretch_px)
+    if not np.any(found.informs > 0.0):
+        # Of a faint structure, which the image has as a whole, no tile tells what it is; all of them count.
+        return replace(found, share=1.0 - float(np.mean(found.disagrees)))
+    return found
 
 
 @dataclass(frozen=True)
