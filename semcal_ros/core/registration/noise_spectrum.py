@@ -28,7 +28,7 @@ of the spectrum allows is what divides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import lru_cache
 from statistics import NormalDist
 
@@ -66,6 +66,8 @@ class ImageStatistics:
         Variance of the white part per pixel, in squared grey levels.
     signal_variance
         Variance of the rest.
+    signal_to_noise
+        That over the variance of the noise before it was resampled, where such an image is known.
     sigma_px
         Width of the Gaussian that minimises the variance of a shift; 0 for none.
     significance
@@ -74,6 +76,7 @@ class ImageStatistics:
 
     noise_variance: float
     signal_variance: float
+    signal_to_noise: float
     sigma_px: float
     significance: float
 
@@ -156,10 +159,7 @@ def measure_richest_parts(
         measure_image(image[part], averaged, None if raw is None else raw[part]) for part in parts
     ]
     # One of them may show something else.
-    noise, signal, sigma, significance = np.median(
-        [(p.noise_variance, p.signal_variance, p.sigma_px, p.significance) for p in found], axis=0
-    ).tolist()
-    return ImageStatistics(noise, signal, sigma, significance)
+    return ImageStatistics(*np.median([astuple(part) for part in found], axis=0).tolist())
 
 
 def measure_image(
@@ -197,7 +197,8 @@ def measure_image(
         white = max(noise, _noise_floor(*_radial_spectrum(raw, side_px)) / averaged)
     signal_variance = float(np.sum(_find_signal(power, white, count) * count) / np.sum(count))
     if white <= 0.0:
-        return ImageStatistics(noise, signal_variance, 0.0, float("inf"))
+        return ImageStatistics(noise, signal_variance, float("inf"), 0.0, float("inf"))
+    ratio = signal_variance / white
     scatter = np.sqrt(2.0 / count)
     signal = power - white
     # Interpolation took noise away where little is left of it: that is no signal below zero.
@@ -211,12 +212,14 @@ def measure_image(
     least = gradient - SMOOTHING_SIGMAS * np.sqrt(psi**2 @ (steep * scatter * power) ** 2 + common)
     is_known = least > 0.0
     if not np.any(is_known):
-        return ImageStatistics(noise, signal_variance, float(SMOOTHINGS_PX[-1]), significance)
+        return ImageStatistics(
+            noise, signal_variance, ratio, float(SMOOTHINGS_PX[-1]), significance
+        )
     single = white * averaged
     noisy = (white + single) * np.maximum(signal, 0.0) + white * single
     variances = (psi**2 @ (steep * noisy))[is_known] / least[is_known] ** 2
     best = SMOOTHINGS_PX[is_known][int(np.argmin(variances))]
-    return ImageStatistics(noise, signal_variance, float(best), significance)
+    return ImageStatistics(noise, signal_variance, ratio, float(best), significance)
 
 
 def _find_signal(power: Array, noise: float, count: Array) -> Array:

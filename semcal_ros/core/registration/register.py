@@ -267,16 +267,16 @@ def prepare_reference(
         averaged,
         None if before is None else _texture(before, inside, limits),
     )
-    if statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance:
+    if statistics.signal_to_noise < SIGNAL_MIN:
         # A sparse specimen need not show anything there; the whole image decides.
         statistics = measure_image(gray, averaged, before)
     is_sparse = False
-    if statistics.signal_variance < WEAK_SIGNAL_MIN * statistics.noise_variance:
+    if statistics.signal_to_noise < WEAK_SIGNAL_MIN:
         # A few particles are a small part of the variance, and tell a shift as well as many.
         found = measure_richest_parts(gray, averaged, before)
-        is_sparse = found.signal_variance > found.noise_variance
-        if statistics.signal_variance < SIGNAL_MIN * statistics.noise_variance:
-            is_sparse = found.signal_variance >= PARTS_SIGNAL_MIN * found.noise_variance
+        is_sparse = found.signal_to_noise > 1.0
+        if statistics.signal_to_noise < SIGNAL_MIN:
+            is_sparse = found.signal_to_noise >= PARTS_SIGNAL_MIN
         if not is_sparse:
             # What is faint everywhere is told by many pixels.
             statistics = measure_image(gray, averaged, before, FAINT_SPECTRUM_PX)
