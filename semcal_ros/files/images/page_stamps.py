@@ -22,7 +22,7 @@ the velocity seems to change by a factor of two from one to the next.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timezone
 from itertools import groupby
@@ -41,10 +41,10 @@ MIN_SPACING_NS = 1_000_000
 _FITTED = 3
 # By how much an image may come late, s, if all of one interval are to fit.
 _LATE_S = 0.1
+# Of how late they are: to a millisecond.
+_LATE_STEPS = 101
 # Of the median interval: what is longer is a pause, and another interval may hold after it.
 _PAUSE = 3.0
-# Steps of a search in which a bracket shrinks by a third: to 1e-15 of the second.
-_SEARCHED = 86
 
 
 @dataclass(frozen=True)
@@ -176,42 +176,17 @@ class _Interval:
 def _fit_interval(seconds: NDArray[np.float64]) -> _Interval | None:
     """Fit images at one interval to the whole seconds in which they were taken; None where no interval fits.
 
-    An image k of an interval d lies in its second if ``s_k <= t + k d < s_k + 1``. So the earliest start that all allow
-    is the largest of ``s_k - k d``, and the latest start the least of ``s_k + 1 - k d``.
+    An image k of an interval d lies in its second if ``s_k <= t + k d < s_k + 1``. Some start t does for all of them if
+    each two allow it: ``|s_j - s_i - (j - i) d| < 1``. Where images come late, the second is as much longer as it must.
     """
-    count = np.arange(len(seconds))
-
-    def lacks(interval_s: float) -> float:
-        """By how much the earliest start is too late: convex in the interval."""
-        offsets = seconds - count * interval_s
-        return float(offsets.max() - (offsets.min() + 1.0))
-
-    low, high = 0.0, float(seconds[-1] + 1.0) / max(len(seconds) - 1, 1)
-    best = _minimise(lacks, low, high)
-    if lacks(best) >= _LATE_S:
-        return None
-    if lacks(best) >= 0.0:
-        offsets = seconds - count * best
-        return _Interval(0.5 * float(offsets.max() + offsets.min() + 1.0), best, best, best)
-    least, most = _find_root(lacks, best, low), _find_root(lacks, best, high)
-    middle = 0.5 * (least + most)
-    offsets = seconds - count * middle
-    return _Interval(0.5 * float(offsets.max() + offsets.min() + 1.0), middle, least, most)
-
-
-def _minimise(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a convex function is least."""
-    for _ in range(_SEARCHED):
-        first, second = low + (high - low) / 3.0, high - (high - low) / 3.0
-        low, high = (low, second) if function(first) <= function(second) else (first, high)
-    return 0.5 * (low + high)
-
-
-def _find_root(function: Callable[[float], float], inside: float, outside: float) -> float:
-    """Where a function that is negative inside is so no more; outside where it is so there, too."""
-    if function(outside) < 0.0:
-        return outside
-    for _ in range(_SEARCHED):
-        middle = 0.5 * (inside + outside)
-        inside, outside = (middle, outside) if function(middle) < 0.0 else (inside, middle)
-    return inside
+    apart = np.arange(1, len(seconds))
+    steps = (seconds[k:] - seconds[:-k] for k in apart.tolist())
+    longest, shortest = np.array([(step.max(), step.min()) for step in steps]).T
+    for second in np.linspace(1.0, 1.0 + _LATE_S, _LATE_STEPS).tolist():
+        least = max(0.0, float(np.max((longest - second) / apart)))
+        most = float(np.min((shortest + second) / apart))
+        if least < most:
+            middle = 0.5 * (least + most)
+            offsets = seconds - np.arange(len(seconds)) * middle
+            return _Interval(0.5 * float(offsets.max() + offsets.min() + 1.0), middle, least, most)
+    return None
