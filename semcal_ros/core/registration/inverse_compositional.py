@@ -451,8 +451,14 @@ def _align(
         if converged:
             break
     assert isinstance(comparison, _Comparison)
-    found = comparison.fit.information
-    chance = _find_chance_gradient(comparison.level, comparison.geometry, found, enough)
+    chance = _find_chance_gradient(
+        comparison.level,
+        comparison.geometry,
+        comparison.sums,
+        comparison.noise,
+        comparison.fit.information,
+        enough,
+    )
     return chance or _summarise(comparison, covariance, converged, passes)
 
 
@@ -570,8 +576,9 @@ def _descend(
                 break
         weights[statistics.rows, statistics.cols] = found
     assert latest is not None
-    information = latest.fit.information
-    chance = _find_chance_gradient(latest.level, latest.geometry, information, ALL_PIXELS)
+    chance = _find_chance_gradient(
+        latest.level, latest.geometry, latest.sums, latest.noise, latest.fit.information, ALL_PIXELS
+    )
     return chance or (latest, covariance, converged, passes)
 
 
@@ -609,25 +616,34 @@ def _compare(
     if weights is not None:
         sums = sums.weighted(weights)
     fit = solve_step(geometry, sums, held)
+    lacks = 0.0 if weights is None else noise
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
-        return _find_chance_gradient(level, geometry, information, enough) or Rejection(
-            MatchFailure.UNDETERMINED, _FEATURELESS
-        )
-    lacks = 0.0 if weights is None else noise
+        return _find_chance_gradient(
+            level, geometry, sums, lacks, information, enough
+        ) or Rejection(MatchFailure.UNDETERMINED, _FEATURELESS)
     return _Comparison(
         level, window, geometry, sums, plain, fit, shift, size, image.mean, lacks, weights
     )
 
 
 def _find_chance_gradient(
-    level: PyramidLevel, geometry: TileGeometry, information: Array, enough: int
+    level: PyramidLevel,
+    geometry: TileGeometry,
+    sums: TileSums,
+    noise: float,
+    information: Array,
+    enough: int,
 ) -> Rejection[MatchFailure] | None:
-    """Reject images that have no more gradient in common than chance gives, in one direction or all."""
+    """Reject images that have no more gradient in common than chance gives, in one direction or all; ``noise`` is the
+    variance that the sums of the reference are without.
+    """
     energy = geometry.total[:2, :2] * np.outer(geometry.gradient_share, geometry.gradient_share)
     pixels = max(min(float(geometry.total[3, 3]), float(enough)), 1.0)
     # Smoothed noise has fewer independent pixels.
-    chance = np.sqrt(shared_pixels(level.sigma_px) / pixels)
+    chance = np.sqrt(shared_pixels(level.sigma_px) / pixels) * _ratio_of_contrasts(
+        geometry, sums, noise
+    )
     values, vectors = np.linalg.eigh(information)
     by_chance = CHANCE_SIGMAS * chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
     if values[0] > by_chance[0]:
@@ -637,6 +653,15 @@ def _find_chance_gradient(
     return Rejection(
         MatchFailure.DISSIMILAR, "images differ: no more gradient in common than by chance"
     )
+
+
+def _ratio_of_contrasts(geometry: TileGeometry, sums: TileSums, noise: float) -> float:
+    """Standard deviation of the image within its tiles over that of the reference with its noise."""
+    own, cross = geometry.normal_matrices, sums.cross.reshape(-1, 4)
+    pixels = np.maximum(own[:, 3, 3], 1e-12)
+    within = float(np.sum(own[:, 2, 2] - own[:, 2, 3] ** 2 / pixels + noise * own[:, 3, 3]))
+    image = float(np.sum(sums.energy.ravel() - cross[:, 3] ** 2 / pixels))
+    return float(np.sqrt(max(image, 0.0) / max(within, 1e-300)))
 
 
 def _sum_blocks(comparison: _Comparison, scores: Array) -> Array:

@@ -116,6 +116,17 @@ def test_reaches_the_cramer_rao_bound_with_honest_covariance(
     assert np.mean(inside < 1.96) > 0.87
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1.0 / 257.0, 0.1, 257.0])
+def test_grey_levels_of_another_depth_are_the_same_image(factor: float) -> None:
+    """Of 16 bits after 8, of parts of one, or of a detector with another gain: the shift does not know."""
+    first, second = _pair((2.3, -1.4), 3.0)
+    usual, scaled = register_pair(first, second), register_pair(first, factor * second)
+    assert usual.accepted and scaled.accepted
+    np.testing.assert_allclose(scaled.shift_px, usual.shift_px, atol=1e-3)
+    np.testing.assert_allclose(scaled.covariance, usual.covariance, rtol=1e-2)
+    assert scaled.contrast == pytest.approx(factor * usual.contrast, rel=1e-3)
+
+
 def test_gain_offset_and_residual_are_measured() -> None:
     reference = noisy(TEXTURE.view((0.0, 0.0), SIZE), 3.0, 0)
     image = 0.5 * noisy(TEXTURE.view((2.2, 1.1), SIZE), 3.0, 1) + 20.0
