@@ -803,13 +803,24 @@ def _overlap_fraction(reference: tuple[int, int], image: tuple[int, int], shift:
 
 
 def _tile_information(comparison: _Comparison) -> Array:
-    """(tiles, 2, 2) each tile's part of the information, in the proportion of its gradients."""
-    own, information = comparison.geometry.tile_energies, comparison.fit.information
-    scale = np.sqrt(np.diag(information))
-    tiles = own * np.outer(scale, scale)
+    """(tiles, 2, 2) each tile's part of the information: its gradients without those of the noise, which are spread
+    evenly and have no part in what the two images have in common.
+    """
+    geometry, information = comparison.geometry, comparison.fit.information
+    gradients = geometry.normal_matrices[:, :2, :2] * np.outer(
+        geometry.gradient_share, geometry.gradient_share
+    )
+    pixels = geometry.normal_matrices[:, 3, 3]
+    evenly = (pixels / pixels.sum())[:, None, None]
+    gain = float(comparison.fit.gain[0])
+    values, vectors = np.linalg.eigh(gain * gradients.sum(axis=0) - information)
+    tiles = gain * gradients - evenly * ((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    if not np.all(np.diag(tiles.sum(axis=0)) > 0.5 * np.diag(information)):
+        tiles = gradients
+    scale = np.sqrt(np.diag(information) / np.diag(tiles.sum(axis=0)))
+    tiles = tiles * np.outer(scale, scale)
     # The products of x and y: those of the common information, spread evenly.
-    missing = information[0, 1] - tiles[:, 0, 1].sum()
-    tiles[:, 0, 1] += missing / len(tiles)
+    tiles[:, 0, 1] += evenly[:, 0, 0] * (information[0, 1] - tiles[:, 0, 1].sum())
     tiles[:, 1, 0] = tiles[:, 0, 1]
     return np.asarray(tiles)
 
@@ -907,8 +918,12 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     found = share > PULL_REST_MIN
     if not np.any(found):
         return np.zeros(2)
-    pulls = np.linalg.solve(rest[found], moves[found, :2, None])[..., 0]
-    return np.asarray(pulls[int(np.argmax(np.einsum("ni,ij,nj->n", pulls, whole, pulls)))])
+    # In units of the whole. Along an edge, the rest may have nothing of the one direction: it says no more of it.
+    white = np.linalg.inv(np.linalg.cholesky(whole))
+    values, vectors = np.linalg.eigh(white @ rest[found] @ white.T)
+    along = np.einsum("nij,ni->nj", vectors, moves[found, :2] @ white.T)
+    pulls = np.einsum("nij,nj->ni", vectors, along / np.maximum(values, PULL_REST_MIN))
+    return np.asarray(pulls[int(np.argmax(np.einsum("ni,ni->n", pulls, pulls)))] @ white)
 
 
 def _chi_squares(sums: Array) -> Array:
@@ -968,7 +983,7 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 3, 3)
     information = whole.transpose(2, 0, 3, 1).reshape(6, 6)
     scaled, scale = equilibrate(information)
-    if not _well_conditioned(scaled):
+    if not (_well_conditioned(scaled) and _is_more_than_chance(comparison, powers, scaled, scale)):
         return None
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = (powers[:, :, None] * comparison.fit.scores[:, None, :]).reshape(-1, 6)
@@ -985,6 +1000,29 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     matrix[2:4, 4:] = factor * aspect * np.array([[0.0, 1.0], [-1.0, 0.0]])
     matrix[4:, 4:] = factor / width * np.array([[0.0, 1.0], [1.0, 0.0]])
     return SimilarityFit(matrix @ step, matrix @ covariance @ matrix.T)
+
+
+def _is_more_than_chance(
+    comparison: _Comparison, powers: Array, information: Array, scale: Array
+) -> bool:
+    """Whether all terms of shifts (tiles, p) ``powers`` are told by more than noise in the gradients gives by chance.
+
+    ``information`` (2 p, 2 p) is that of the terms, scaled by ``scale`` (2 p,). Of one edge, which a change of the
+    scale moves nearly as a shift and a shear do, it has little but noise.
+    """
+    geometry, level = comparison.geometry, comparison.level
+    share = np.outer(geometry.gradient_share, geometry.gradient_share)
+    gradients = (geometry.normal_matrices[:, :2, :2] * share).reshape(-1, 4)
+    count = powers.shape[1]
+    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(len(powers), -1)
+    whole = (gradients.T @ pairs).reshape(2, 2, count, count)
+    energy = whole.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count) * np.outer(scale, scale)
+    pixels = max(float(geometry.total[3, 3]), 1.0)
+    contrast = _ratio_of_contrasts(geometry, comparison.sums, comparison.noise)
+    chance = CHANCE_SIGMAS * contrast * np.sqrt(shared_pixels(level.sigma_px) / pixels)
+    values, vectors = np.linalg.eigh(information)
+    by_chance = chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
+    return bool(np.all(values > by_chance))
 
 
 def tile_residual_energies(
