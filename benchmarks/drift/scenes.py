@@ -165,6 +165,17 @@ def holes(rng: Rng) -> Floats:
     return 0.6 - _discs(rng, 120, (5.0, 13.0), (0.3, 0.5))
 
 
+def membrane(rng: Rng) -> Floats:
+    """One soft edge with a bright rim, that of a cell larger than the field; nothing is in it or beside it."""
+    y, x = np.indices((TORUS, TORUS)) - 0.5 * TORUS
+    middle = rng.uniform(-40.0, 40.0, 2) - [0.7 * SIZE, 0.0]
+    angle = np.arctan2(y - middle[1], x - middle[0]) + rng.uniform(0, 2 * np.pi)
+    radius = 0.7 * SIZE * (1.0 + 0.1 * np.sin(3 * angle) + 0.05 * np.sin(7 * angle))
+    beyond = np.hypot(x - middle[0], y - middle[1]) - radius
+    inside = 1.0 / (1.0 + np.exp(np.clip(beyond / 4.0, -50.0, 50.0)))
+    return np.asarray(0.35 + 0.3 * inside + 0.25 * np.exp(-((beyond / 5.0) ** 2)))
+
+
 def clouds(rng: Rng) -> Floats:
     return _spectrum(rng, lambda f: np.exp(-((f * 35.0) ** 2)))
 
@@ -387,6 +398,7 @@ KINDS: dict[str, Kind] = {
     "wires": Kind(wires),
     "pillars": Kind(pillars),
     "holes": Kind(holes),
+    "membrane": Kind(membrane),
     "pores": Kind(pores),
     "pores and a jump": Kind(pores, jump_px=20.0),
     "dusty grating": Kind(dusty_grating),

@@ -868,7 +868,12 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, A
     whole = (by_row.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
     information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
     scaled, scale = equilibrate(information)
-    if rows < SHEAR_ROWS_MIN or not _well_conditioned(scaled):
+    each = np.repeat(powers, cols, axis=0)
+    if (
+        rows < SHEAR_ROWS_MIN
+        or not _well_conditioned(scaled)
+        or not _is_more_than_chance(comparison, each, scaled, scale)
+    ):
         return np.full(4, np.nan), np.full((4, 4), np.inf), comparison.fit.scores
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = comparison.fit.scores.reshape(rows, cols, 2)
@@ -879,7 +884,6 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, A
     explained = weights.reshape(rows, cols, 2, 2) @ steps[:, None, :, None]
     residual = scores + explained[..., 0]
     tilted = np.concatenate([residual, powers[:, 1, None, None] * residual], axis=2)
-    each = np.repeat(powers, cols, axis=0)
     covariance = _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
     return joint, covariance, residual.reshape(-1, 2)
 

@@ -613,3 +613,27 @@ def test_faint_images_are_compared_with_all_their_pixels() -> None:
     assert found.accepted, found.rejection
     error_px = np.abs(found.shift_px - [-3.0, 0.0])
     assert np.all(error_px < 4.0 * np.sqrt(np.diag(found.covariance)))
+
+
+def _edge(shift: tuple[float, float], scale: float, seed: int) -> np.ndarray:
+    """A soft edge with a bright rim that bends once through the image, at 150 electrons per px, and nothing else."""
+    y, x = (np.indices((256, 256)) - 127.5) / scale
+    x, y = x - shift[0], y - shift[1]
+    beyond = (x - 40.0 * np.tanh(y / 40.0) - 10.0) / np.hypot(1.0, np.cosh(y / 40.0) ** -2)
+    level = 0.35 + 0.3 / (1.0 + np.exp(-beyond / 4.0)) + 0.25 * np.exp(-((beyond / 5.0) ** 2))
+    counted = np.random.default_rng(seed).poisson(150.0 * level) / 150.0
+    return np.clip(np.rint(200.0 * counted), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.01])
+def test_one_edge_does_not_tell_a_scale(scale: float) -> None:
+    """A change of it moves the edge nearly as a shift and a shear do; what its gradients leave is noise, which would
+    answer with a scale of its own.
+    """
+    for seed in range(6):
+        found = register_pair(_edge((0.0, 0.0), 1.0, seed), _edge((1.3, -0.8), scale, 100 + seed))
+        assert found.fit_similarity() is None
+        if scale == 1.0:
+            error = found.shift_px - [1.3, -0.8]
+            assert found.accepted, found.reason
+            assert error @ np.linalg.solve(found.covariance, error) < 25.0
