@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from xml.etree import ElementTree
@@ -35,6 +36,7 @@ _SQUARE_TOLERANCE = 1e-3
 _YEARS = (1971, 2037)  # what the 32-bit seconds of a ROS stamp hold
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_COMMA_NUMBER = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*[a-zA-Z\u00b5\u03bc]{0,3}")
 _DURATIONS_S = {"sec": 1.0, "secs": 1.0, "min": 60.0, "mins": 60.0, "hour": 3600.0, "hours": 3600.0}
 _PREFIX = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3}
 _MAX_BYTES = 1_000_000  # the text files have a few kB
@@ -143,6 +145,25 @@ def check_pixel_size(path: Path, value: float | None, key: str, seen: object) ->
             do="export the image again with its metadata",
         )
     return value
+
+
+def refuse_decimal_commas(path: Path, values: Mapping[str, object]) -> None:
+    """Refuse numbers that were written with a comma, such as ``0,349``: which of them are decimal is not for a reader
+    to guess, and one that is left out would be missed in silence.
+
+    Raises
+    ------
+    TiffError
+        One of the values, by their keys, is such a number.
+    """
+    for key, value in values.items():
+        text = str(value).strip()
+        if _COMMA_NUMBER.fullmatch(text):
+            raise TiffError(
+                f"{path.name}: {key} is {text[:60]!r}",
+                expected="numbers with a decimal point",
+                do="set the computer of the microscope to decimal points, and export the image again",
+            )
 
 
 def is_credible_year(year: int) -> bool:

@@ -31,8 +31,20 @@ from semcal_ros.files.images.metadata import (
     plain_number,
     positive,
     quantity,
+    refuse_decimal_commas,
 )
 from semcal_ros.files.images.sem_image import VendorSettings
+
+_NUMBERS = (
+    "CM_MAG",
+    "SM_WD",
+    "SM_SCAN_ROTATION",
+    "CM_ACCEL_VOLT",
+    "CM_ACCEL_VOLTAGE",
+    "SM_MICRON_BAR",
+)
+# By which a field of view and a magnification may differ: a unit that is lost is a factor of a thousand.
+_CONTRADICTION = 100.0
 
 USUAL_DISPLAY_WIDTH_M = 0.128
 """Width of the photograph to which JEOL's magnification usually refers.
@@ -81,10 +93,19 @@ def _read_pixel_size(
 ) -> tuple[float, bool, tuple[str, ...]]:
     """Return the pixel size in m, whether it rests on an assumed display width, and notes."""
     words = pairs.get("CM_FIELD_OF_VIEW", "").split()
+    refuse_decimal_commas(path, {"$CM_FIELD_OF_VIEW": words[0] if words else ""})
     field_m = positive(quantity(words[0], "m", default_unit="um")) if words else None
-    if field_m is not None:
-        return check_pixel_size(path, field_m / columns, "$CM_FIELD_OF_VIEW", words[0]), False, ()
     shown = positive(plain_number(pairs.get("CM_MAG", "")))
+    if field_m is not None:
+        by_magnification = USUAL_DISPLAY_WIDTH_M / (shown or USUAL_DISPLAY_WIDTH_M / field_m)
+        if not 1.0 / _CONTRADICTION < field_m / by_magnification < _CONTRADICTION:
+            raise TiffError(
+                f"{path.name}: $CM_FIELD_OF_VIEW is {pairs['CM_FIELD_OF_VIEW'][:40]}, and $CM_MAG {shown:g} is a field "
+                f"of {1e6 * by_magnification:g} um",
+                expected="a field of view in um, or with its unit, that fits the magnification",
+                do="export the image again with its text file",
+            )
+        return check_pixel_size(path, field_m / columns, "$CM_FIELD_OF_VIEW", words[0]), False, ()
     from_bar = _read_micron_bar(pairs)
     if shown is None:
         if from_bar is None:
@@ -131,9 +152,10 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
     Raises
     ------
     TiffError
-        There is neither a field of view, nor a magnification, nor a micron bar; or the sizes
-        contradict each other.
+        There is neither a field of view, nor a magnification, nor a micron bar; the sizes contradict each other; or
+        numbers have decimal commas.
     """
+    refuse_decimal_commas(path, {f"${key}": pairs[key] for key in _NUMBERS if key in pairs})
     columns, rows = _read_scan_size(path, pairs, size_px)
     pixel_m, assumed, notes = _read_pixel_size(path, pairs, columns)
     distance_mm = plain_number(pairs.get("SM_WD", ""))

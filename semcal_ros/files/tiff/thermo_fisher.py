@@ -37,6 +37,7 @@ from semcal_ros.files.images.metadata import (
     plain_number,
     positive,
     quantity_of,
+    refuse_decimal_commas,
     text_of,
     tilt_correction_note,
 )
@@ -46,6 +47,12 @@ from semcal_ros.files.images.sem_image import VendorSettings
 TAGS = (34682, 34680)
 ROOT = "Metadata"
 _BEAMS = {"EBeam": "electron", "IBeam": "ion", "Electron": "electron", "Ion": "ion"}
+_NUMBERS = (
+    *("PixelWidth", "PixelHeight", "HV", "WD", "ScanRotation", "StageT", "StageR"),
+    *("Dwell", "Dwelltime", "FrameTime"),
+)
+# Relative difference of the width of the field from that of its pixels beyond which a note says so.
+_FIELD_TOLERANCE = 1e-2
 # Width of the picture for which the XL series states a magnification, m, where a file does not say it: the longer
 # side of a Polaroid picture.
 _XL_WIDTH_M = 0.1133
@@ -170,13 +177,15 @@ def thermo_fisher_settings(
     Raises
     ------
     TiffError
-        The pixel size is missing or unusable, or the size of the file contradicts the tag.
+        The pixel size is missing or unusable, the size of the file contradicts the tag, or numbers have decimal commas.
     """
     if "Vector" in tag:
         return _xl_settings(path, tag, size_px)
     stage = _section(tag, "Stage")
     beam, scan = _active(tag, "Beam", "EBeam"), _active(tag, "Scan", "EScan")
     common = _section(tag, "Scan")
+    for section in (stage, beam, common, scan):
+        refuse_decimal_commas(path, {key: section[key] for key in _NUMBERS if key in section})
     seen = scan.get("PixelWidth", common.get("PixelWidth"))
     _check_is_a_scan(path, tag, beam, seen)
     pixel_m = check_pixel_size(
@@ -186,6 +195,12 @@ def thermo_fisher_settings(
     check_pixel_size(path, pixel_y_m, "PixelHeight", pixel_y_m)
     magnification, notes = _magnification(tag, pixel_m * size_px[0])
     notes += aspect_notes(pixel_m, pixel_y_m)
+    field_m = positive(plain_number(scan.get("HorFieldsize", common.get("HorFieldsize"))))
+    if field_m is not None and abs(field_m / (pixel_m * size_px[0]) - 1.0) > _FIELD_TOLERANCE:
+        notes.append(
+            f"HorFieldsize, {1e6 * field_m:.4g} um, is not that of {size_px[0]} pixels of {1e9 * pixel_m:.4g} nm: "
+            "the size of the pixels is taken"
+        )
     image, voltage = _section(tag, "Image"), plain_number(beam.get("HV"))
     if str(beam.get("TiltCorrectionIsOn", "")).lower() in ("yes", "true", "on"):
         notes.append(tilt_correction_note(plain_number(beam.get("TiltCorrectionAngle"))))

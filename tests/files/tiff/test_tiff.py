@@ -288,6 +288,25 @@ def test_thermo_fisher_takes_the_active_beam_and_cuts_the_databar(tmp_path: Path
     assert other.pixel_size_m == sem.pixel_size_m
 
 
+def test_thermo_fisher_refuses_decimal_commas(tmp_path: Path) -> None:
+    """Without the tilt, a calibration would be made as without a stage."""
+    text = fei_text()
+    assert text.count(b"StageT=") == 1
+    start, _, rest = text.partition(b"StageT=")
+    text = start + b"StageT=0,349\r\n" + rest.partition(b"\n")[2]
+    with pytest.raises(TiffError, match="StageT is '0,349'"):
+        read_sem_tiff(write_tagged(tmp_path / "f.tif", 34682, text))
+
+
+def test_thermo_fisher_notes_a_field_that_its_pixels_do_not_have(tmp_path: Path) -> None:
+    pixels = fei_text()
+    for factor, noted in ((1.0, False), (2.0, True)):
+        field = f"[IScan]\r\nHorFieldsize={factor * 32 * 2.69792e-07!r}".encode()
+        text = pixels.replace(b"[IScan]", field)
+        sem = read_sem_tiff(write_tagged(tmp_path / f"{factor}.tif", 34682, text))
+        assert any("HorFieldsize" in note for note in sem.notes) == noted
+
+
 def test_thermo_fisher_refuses_a_resized_copy(tmp_path: Path) -> None:
     path = write_tagged(tmp_path / "f.tif", 34682, fei_text(columns=64))
     with pytest.raises(TiffError, match="original file"):
@@ -404,6 +423,23 @@ def test_jeol_field_of_view_in_every_spelling(tmp_path: Path, field: str, encodi
     sem = read_sem_tiff(write_jeol(tmp_path / "j.tif", text, encoding))
     assert sem.pixel_size_m == pytest.approx(2e-6, rel=1e-12, abs=0)
     assert not sem.settings.display_width_assumed
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"CM_FIELD_OF_VIEW": "64,0000 40,0000"}, r"\$CM_FIELD_OF_VIEW is '64,0000'"),
+        ({"CM_FIELD_OF_VIEW": "64.0nm 40.0nm"}, r"\$CM_MAG 50 is a field of 2560 um"),
+        ({"CM_MAG": "50,5"}, r"\$CM_MAG is '50,5'"),
+        ({"SM_WD": "9,07"}, r"\$SM_WD is '9,07'"),
+    ],
+)
+def test_jeol_refuses_decimal_commas_and_contradictions(
+    tmp_path: Path, changed: dict[str, str], said: str
+) -> None:
+    """Left out, they would be replaced by a display width that is assumed."""
+    with pytest.raises(TiffError, match=said):
+        read_sem_tiff(write_jeol(tmp_path / "j.tif", jeol_text(**changed)))
 
 
 def test_jeol_micron_bar_confirms_or_replaces_the_assumption(tmp_path: Path) -> None:
