@@ -55,6 +55,8 @@ _EXAMINED = 3
 _TURNED_RAD = 1e-3
 
 _STAMP_S = 1.0  # makers give whole seconds
+# Relative difference of two magnifications that is that of rounding, and no other setting.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -494,10 +496,18 @@ def list_image_series(
     if magnification is None and pixel_size_m is None:
         scale_notes.append(f"magnifications refer to a display width of {display_width_m:g} m")
 
+    settings: list[float] = []
+
     def magnify(page: ImagePage) -> float:
         if magnification is not None:
             return magnification
-        return display_width_m / ((pixel_size_m or page.pixel_size_m or 0.0) * page.size_px[0])
+        pixel_m = pixel_size_m or page.pixel_size_m or 0.0
+        found = display_width_m / (pixel_m * page.size_px[0])
+        # The same setting, where one file says 100 nm and the next one 0.1 um.
+        known = next((g for g in settings if abs(found / g - 1.0) < _ROUNDING), None)
+        if known is None:
+            settings.append(found)
+        return found if known is None else known
 
     images = tuple(
         SeriesImage(

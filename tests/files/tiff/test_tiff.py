@@ -29,6 +29,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from semcal_ros.core.errors import TiffError
+from semcal_ros.files.images.image_series import list_image_series
 from semcal_ros.files.tiff.olympus import olympus_settings
 from semcal_ros.files.tiff.read import read_page_settings, read_sem_tiff
 from tests.helpers.sem_files import zeiss_text
@@ -286,6 +287,15 @@ def test_thermo_fisher_takes_the_active_beam_and_cuts_the_databar(tmp_path: Path
     assert sem.settings.serial_number == "9923184"
     other = read_sem_tiff(write_tagged(tmp_path / "g.tif", 34680, fei_text(rows=16)))
     assert other.pixel_size_m == sem.pixel_size_m
+
+
+def test_one_pixel_size_in_two_spellings_is_one_magnification(tmp_path: Path) -> None:
+    for number, pixel in enumerate(("1e-07", "1.0000000000000003e-07", "1e-07", "1.0001e-07")):
+        write_tagged(tmp_path / f"{number}.tif", 34682, fei_text(pixel=pixel))
+    series = list_image_series(sorted(tmp_path.iterdir()), display_width_m=0.128)
+    first, second, third, other = (image.magnification for image in series.images)
+    assert first == second == third
+    assert other == pytest.approx(first / 1.0001, rel=1e-9)
 
 
 def test_thermo_fisher_refuses_decimal_commas(tmp_path: Path) -> None:
