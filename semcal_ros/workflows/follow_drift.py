@@ -90,12 +90,15 @@ class DriftFollower:
         settings = DriftSettings(registration=registration, similarity=True)
         self.tracker = DriftTracker(settings, history=self.history)
         self.updates: list[DriftUpdate] = []
+        #: Lines of the latest frame.
+        self.height_px = 0
         self._smoothed: DriftPath | None = None
 
     def update(
         self, frame: RecordedFrame, time_s: float, camera: ScanCamera, scan: ScanTiming | None
     ) -> DriftUpdate:
         """Update with the next frame and return its drift."""
+        self.height_px = frame.visible.shape[0]
         update = self.tracker.update(frame.visible, time_s, camera, scan)
         if self.history is not None:
             self.updates.append(update)
@@ -151,8 +154,9 @@ def estimate_timing(
     if not step_px > _FAST_PX:
         return config, ""
     return config, (
-        f"the configuration has no scan; drift of up to {step_px:.1f} px from frame to frame may "
-        f"shear the frames, too; {GIVE_FRAME_TIME}"
+        f"the configuration has no scan; drift of up to {step_px:.1f} px from frame to frame may shear the frames, "
+        f"too, and is then wrong by up to {100.0 * step_px / follower.height_px:.2g} %, which its sigma does not contain; "
+        f"{GIVE_FRAME_TIME}"
     )
 
 

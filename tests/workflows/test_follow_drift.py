@@ -34,7 +34,9 @@ LOST = Rejection(MatchFailure.NO_PEAK, "lost")
 
 
 def note_of(updates: Sequence[DriftUpdate]) -> str:
-    follower: Any = SimpleNamespace(updates=updates, path=lambda live: DriftPath(updates))
+    follower: Any = SimpleNamespace(
+        updates=updates, height_px=200, path=lambda live: DriftPath(updates)
+    )
     config, note = estimate_timing(load_config("generic"), follower, None)
     assert config.scan is None
     return note
@@ -56,7 +58,10 @@ def updates(step_px: float, rejected: Sequence[int] = ()) -> list[DriftUpdate]:
 def test_fast_drift_is_noted_where_the_shear_of_the_frames_is_unknown(
     step_px: float, noted: bool
 ) -> None:
-    assert ("drift of up to 0.6 px" in note_of(updates(step_px))) == noted
+    note = note_of(updates(step_px))
+    assert ("drift of up to 0.6 px" in note) == noted
+    # What the beam sees of a specimen that moves by v T in a frame is 1 + v T / height as large.
+    assert ("wrong by up to 0.3 %" in note) == noted
 
 
 def test_frames_that_were_only_predicted_do_not_count() -> None:
