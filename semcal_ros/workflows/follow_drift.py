@@ -155,8 +155,8 @@ def estimate_timing(
         return config, ""
     return config, (
         f"the configuration has no scan; drift of up to {step_px:.1f} px from frame to frame may shear the frames, "
-        f"too, and is then wrong by up to {100.0 * step_px / follower.height_px:.2g} %, which its sigma does not contain; "
-        f"{GIVE_FRAME_TIME}"
+        f"too, and is then wrong by up to {100.0 * step_px / follower.height_px:.2g} %, which its sigma does not "
+        f"contain; {GIVE_FRAME_TIME}"
     )
 
 
