@@ -26,7 +26,8 @@ import click
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.options import config_option, needs_ros, options_of, refuse_with, require_folder
-from semcal_ros.config.config import load_config
+from semcal_ros.config.config import MicroscopeConfig, load_config
+from semcal_ros.core.calibration.acquisition import AcquisitionGoal
 from semcal_ros.core.calibration.thresholds import VIEWS_MAX
 from semcal_ros.core.errors import InvalidValueError, SemcalError
 from semcal_ros.core.ladder.acquisition import plan_ladder
@@ -145,6 +146,19 @@ class AcquisitionOptions:
                 f"--namespace {self.namespace}", expected="a name that begins with /"
             )
 
+    def check_goal(self, config: MicroscopeConfig) -> None:
+        """Refuse what the node would refuse once it has a picture; raises :class:`InvalidValueError`."""
+        if self.magnifications is None:
+            return
+        AcquisitionGoal(
+            self.magnifications,
+            config.squares_m,
+            config.display_width_m,
+            self.target,
+            self.tilts,
+            self.most_views,
+        )
+
     def node_parameters(self, config: str) -> dict[str, object]:
         """Return the parameters of the node ``calibration_server`` that say the same."""
         parameters: dict[str, object] = {
@@ -193,7 +207,7 @@ def command(options: AcquisitionOptions, config: str) -> None:
       semcal acquire -o cal_20kx.yaml --extend cal.yaml --to 20000x --microscope virtual_sem --config virtual_sem
     """
     options.check()
-    load_config(config)
+    options.check_goal(load_config(config))
     with needs_ros("rclpy for a live microscope"):
         from semcal_ros.nodes.acquire import run_acquisition
     arguments = ["--ros-args", "-r", f"__ns:={options.namespace}", "--log-level", "error"]

@@ -32,8 +32,8 @@ from semcal_ros.nodes.calibration_server import CalibrationServer
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
 from semcal_ros.nodes.common.run import run_node
 
-# As long as a slow scan may take, and the middleware to find a microscope.
-_FIRST_PICTURE_S = 60.0
+# As long as a slow scan may take, and the middleware to find a microscope; after a few seconds the wait is said.
+_FIRST_PICTURE_S, _QUIET_S = 60.0, 3.0
 _POLL_S = 0.1
 # What the target is missed by, or what failed.
 _MISSED = 1
@@ -91,14 +91,21 @@ class _Acquirer(CalibrationServer):
             self._begin_acquisition()
             self._follow()
         except NODE_ERRORS as error:
-            print(" ".join(str(error).split()), file=sys.stderr)
+            print("semcal:", *str(error).split(), file=sys.stderr)
         finally:
             self._ended = True
 
     def _begin_acquisition(self) -> None:
-        end_s = time.monotonic() + _FIRST_PICTURE_S
+        start_s, said = time.monotonic(), False
         while not self.has_picture:
-            if time.monotonic() > end_s:
+            waited_s = time.monotonic() - start_s
+            if waited_s > _QUIET_S and not said:
+                said = True
+                topic = self.resolve_topic_name("image_raw")
+                self._say(
+                    f"waiting for pictures on {topic} and their magnification, for up to {_FIRST_PICTURE_S:g} s"
+                )
+            if waited_s > _FIRST_PICTURE_S:
                 raise MicroscopeError(
                     f"no picture with a known magnification for {_FIRST_PICTURE_S:g} s",
                     do="check that the microscope publishes, by `semcal doctor`",

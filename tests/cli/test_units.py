@@ -83,6 +83,16 @@ def test_bare_tilts_are_degrees(command: click.Command, text: str) -> None:
             "'2um' is not an angle",
         ),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--tilts", ""), "is not an angle"),
+        # Before anybody waits for a microscope.
+        (("acquire", "-o", "c.yaml", "--range", "2000,500"), "expected the lower one first"),
+        (
+            ("acquire", "-o", "c.yaml", "--range", "500,2000", "--tilts", "0,95"),
+            "a tilt of 95 degrees",
+        ),
+        (
+            ("acquire", "-o", "c.yaml", "--range", "500,9000", "--most-views", "6"),
+            "6 views; expected at least",
+        ),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--resume", "gone"), "does not exist"),
         (("acquire", "-o", "c.yaml"), "neither --range nor --extend"),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--extend", "c"), "--range and --extend"),
