@@ -20,32 +20,45 @@ from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
 
+# Of the measured rows: each says in how many cases it was tried, and what changed in them (doc/thresholds.md).
+TRIED = "python -m benchmarks.thresholds drift, 28 November 2026"
+
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
 # Defaults of DriftSettings, in settings.py
 
-REKEY_OVERLAP = TABLE.stated(
+REKEY_OVERLAP = TABLE.measured(
     "REKEY_OVERLAP", 0.6, "of the image",
     "That a keyframe must share with a frame to stay the one in use: twice the least with which a shift is searched "
-    "for, so that the next keyframe is measured against it while both still see much of the same.",
+    "for, so that the next keyframe is measured against it while both still see much of the same. 1.5 times as large "
+    "or as small, it changes nothing in 26 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-JUMP_MAX = TABLE.stated(
+JUMP_MAX = TABLE.measured(
     "JUMP_MAX", 0.25, "of the image",
-    "Between frames; more that was not expected is a move of the stage: drift is slower by far.",
+    "Between frames; more that was not expected is a move of the stage: drift is slower by far. 1.5 times as large, 3 "
+    "of 26 cases are decided otherwise; as small, errors change by less than 0.1 %.",
+    command=TRIED,
 )
-FIRST_STEP_PX = TABLE.stated(
+FIRST_STEP_PX = TABLE.measured(
     "FIRST_STEP_PX", 3.0, "px",
-    "1-sigma of the drift between the first two frames, of which nothing is known; innovations take its place.",
+    "1-sigma of the drift between the first two frames, of which nothing is known; innovations take its place. 1.5 "
+    "times as large, errors are 6.6 % larger; as small, errors are 8.0 % larger, in 26 cases.",
+    command=TRIED,
 )
-RATIO_MAX = TABLE.stated(
+RATIO_MAX = TABLE.measured(
     "RATIO_MAX", 2.5, "ratio of scales",
-    "Across which a keyframe is resampled: at this one, a sixth of the coarser picture is in the finer one.",
+    "Across which a keyframe is resampled: at this one, a sixth of the coarser picture is in the finer one. 1.5 times "
+    "as large or as small, it changes nothing in 26 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-LOST_AFTER = TABLE.stated(
+LOST_AFTER = TABLE.measured(
     "LOST_AFTER", 8, "frames",
     "In a row that match nothing, after which the place that was seen is given up: what disturbs a few frames, as a "
-    "touch of the table does, is over by then.",
+    "touch of the table does, is over by then. 1.5 times as large, it changes nothing; as small, 4 of 26 cases are "
+    "decided otherwise and errors are 124 % larger.",
+    command=TRIED,
 )
 KEYFRAMES_MAX = TABLE.cost(
     "KEYFRAMES_MAX", 48, "keyframes",
@@ -58,15 +71,18 @@ KEYFRAME_BYTES_MAX = TABLE.cost(
 
 # Steps, in tracker.py
 
-VELOCITY_CHANGE = TABLE.stated(
+VELOCITY_CHANGE = TABLE.measured(
     "VELOCITY_CHANGE", 0.1, "of the first step",
-    "By how much the velocity is expected to change per frame, to begin with; the innovations correct it within "
-    "some frames.",
+    "By how much the velocity is expected to change per frame, to begin with; the innovations correct it within some "
+    "frames. 1.5 times as large, errors are 6.8 % larger; as small, errors are 8.1 % larger, in 25 cases.",
+    command=TRIED,
 )
-PAUSE_MIN = TABLE.stated(
+PAUSE_MIN = TABLE.measured(
     "PAUSE_MIN", 10.0, "time constants",
-    "Time without a frame after which nothing says that the drift went on as it was: of its acceleration, nothing "
-    "is left by then.",
+    "Time without a frame after which nothing says that the drift went on as it was: of its acceleration, nothing is "
+    "left by then. 1.5 times as large or as small, it changes nothing in 25 cases; a thousand times or a thousandth "
+    "of it does.",
+    command=TRIED,
 )
 CANDIDATES = TABLE.cost(
     "CANDIDATES", 2, "keyframes",
@@ -98,9 +114,11 @@ PULLED_CHI2_MIN = TABLE.derived(
 
 # Belief, in filter_update.py and gating.py
 
-DISPUTED_SIGMAS = TABLE.stated(
+DISPUTED_SIGMAS = TABLE.measured(
     "DISPUTED_SIGMAS", 2.0, "sigma",
-    "At which a disputed position counts: if it is the right one, the stated sigma covers it twice.",
+    "At which a disputed position counts: if it is the right one, the stated sigma covers it twice. 1.5 times as "
+    "large or as small, 25 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 INNOVATION_CHI2_MAX = TABLE.derived(
     "INNOVATION_CHI2_MAX", 27.6, "chi-square, 2 degrees of freedom",
@@ -147,18 +165,24 @@ KEPT_CORRELATION_MIN = TABLE.stated(
     "KEPT_CORRELATION_MIN", 0.75, "correlation",
     "A frame that agrees less with its keyframe takes its place: the specimen changes.",
 )
-MERGED_CORRELATION_MIN = TABLE.stated(
+MERGED_CORRELATION_MIN = TABLE.measured(
     "MERGED_CORRELATION_MIN", 0.85, "correlation",
-    "Of a frame that becomes part of a mean: a specimen that changes spoils none before its keyframe is replaced.",
+    "Of a frame that becomes part of a mean: a specimen that changes spoils none before its keyframe is replaced. 1.5 "
+    "times as large or as small, it changes nothing in 24 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-MERGED_GAINS = TABLE.stated(
+MERGED_GAINS = TABLE.measured(
     "MERGED_GAINS", (0.5, 2.0), "ratio of contrasts",
-    "Between which a frame becomes part of a mean: beyond, its noise counts four times as much, or its grey "
-    "levels are clipped.",
+    "Between which a frame becomes part of a mean: beyond, its noise counts four times as much, or its grey levels "
+    "are clipped. 1.5 times as large or as small, it changes nothing in 24 cases; a thousand times or a thousandth of "
+    "it does.",
+    command=TRIED,
 )
-MERGED_SHEAR_PX_MAX = TABLE.stated(
+MERGED_SHEAR_PX_MAX = TABLE.measured(
     "MERGED_SHEAR_PX_MAX", 0.1, "px",
-    "Shear of a frame that does not blur a mean: half of it at the upper and the lower edge.",
+    "Shear of a frame that does not blur a mean: half of it at the upper and the lower edge. 1.5 times as large or as "
+    "small, 24 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 OPEN_SIGMAS = TABLE.derived(
     "OPEN_SIGMAS", 2.0, "sigma",
@@ -175,10 +199,12 @@ PLACE_SIGMA_PX_MAX = TABLE.derived(
     "1-sigma of a shift that a mean bears: structure at a third of a cycle per pixel is blurred by 8 %, 1 - "
     "exp(-2 (0.2 pi / 3)^2).",
 )
-COPY_NOISE = TABLE.stated(
+COPY_NOISE = TABLE.measured(
     "COPY_NOISE", 0.15, "of the variance",
     "Of a shift by which the position of a frame as a keyframe differs from the measured one: as a reference its "
-    "noise weighs otherwise than as an image. Seen in the closure of triples of frames.",
+    "noise weighs otherwise than as an image. Seen in the closure of triples of frames. 1.5 times as large or as "
+    "small, 25 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 COPY_NOISE_BESIDE = TABLE.stated(
     "COPY_NOISE_BESIDE", 5.0, "of the variance",
@@ -196,19 +222,23 @@ CHANGE_MARGIN = TABLE.stated(
     "CHANGE_MARGIN", 0.05, "of the image",
     "By which an old keyframe must overlap more than is asked of the one in use, or two of them would take turns.",
 )
-MERGED_OVERLAP_MIN = TABLE.stated(
+MERGED_OVERLAP_MIN = TABLE.measured(
     "MERGED_OVERLAP_MIN", 0.75, "of the image",
-    "That a frame must show of a mean that it becomes part of, so that the noise of the mean is nearly even.",
+    "That a frame must show of a mean that it becomes part of, so that the noise of the mean is nearly even. 1.5 "
+    "times as large or as small, it changes nothing in 24 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 MEAN_COUNTS = TABLE.derived(
     "MEAN_COUNTS", (2, 4, 8, 16, 32), "frames",
     "In a mean at which it replaces the prepared reference: each time its noise variance has halved. From 32 "
     "frames on, it adds 1.5 % to the sigma of a shift, sqrt(1 + 1/32).",
 )
-MASKED_MAX = TABLE.stated(
+MASKED_MAX = TABLE.measured(
     "MASKED_MAX", 0.01, "of the image",
-    "That is newly left out of a reference which is kept otherwise: so few pixels decide on no peak of the search over "
-    "all shifts, in which they show.",
+    "That is newly left out of a reference which is kept otherwise: so few pixels decide on no peak of the search "
+    "over all shifts, in which they show. 1.5 times as large or as small, it changes nothing in 7 cases; a thousand "
+    "times or a thousandth of it does.",
+    command=TRIED,
 )
 COMMON_PX_MIN = TABLE.cost(
     "COMMON_PX_MIN", 8, "px",
@@ -218,34 +248,41 @@ BLUR_BELOW = TABLE.stated(
     "BLUR_BELOW", 0.95, "ratio of scales",
     "An image that shrinks by more must be blurred first, or it would alias; by 5 % it hardly does.",
 )
-PIXEL_SIGMA_PX = TABLE.stated(
+PIXEL_SIGMA_PX = TABLE.measured(
     "PIXEL_SIGMA_PX", 0.45, "px",
-    "Width of a pixel as a Gaussian: to that of a pixel of the new image an image that shrinks is blurred.",
+    "Width of a pixel as a Gaussian: to that of a pixel of the new image an image that shrinks is blurred. 1.5 times "
+    "as large or as small, the errors of one case change by 0.2 % at most.",
+    command=TRIED,
 )
 
 # What never moves, in static_parts.py
 
-OVERLAY_FIRST_FRAMES = TABLE.stated(
+OVERLAY_FIRST_FRAMES = TABLE.measured(
     "OVERLAY_FIRST_FRAMES", 3, "frames",
-    "In which an overlay is looked for: one is there from the start, and a second and a third look confirm it.",
+    "In which an overlay is looked for: one is there from the start, and a second and a third look confirm it. 1.5 "
+    "times as large or as small, 25 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 OVERLAY_EVERY_FRAMES = TABLE.cost(
     "OVERLAY_EVERY_FRAMES", 8, "frames",
     "After which an overlay is looked for again.",
 )
-FIXED_FIRST = TABLE.stated(
+FIXED_FIRST = TABLE.measured(
     "FIXED_FIRST", 4, "comparisons",
-    "After which what stays is looked for more seldom, by one frame more each time; a spot does not show where "
-    "the specimen is as dark, so that one look is not enough.",
+    "After which what stays is looked for more seldom, by one frame more each time; a spot does not show where the "
+    "specimen is as dark, so that one look is not enough. 1.5 times as large or as small, it changes nothing in 25 "
+    "cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 FIXED_EVERY_FRAMES_MAX = TABLE.cost(
     "FIXED_EVERY_FRAMES_MAX", 32, "frames",
     "After which what stays is looked for again at the latest.",
 )
-NEWLY_FIXED = TABLE.stated(
+NEWLY_FIXED = TABLE.measured(
     "NEWLY_FIXED", 1e-4, "of the image",
-    "That must newly be found to stay for keyframes to be freed of it, which makes their means start again: 25 of "
-    "512 x 512 px.",
+    "That must newly be found to stay for keyframes to be freed of it, which makes their means start again: 25 of 512 "
+    "x 512 px. 1.5 times as large or as small, 25 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 FIXED_PULL_MIN = TABLE.derived(
     "FIXED_PULL_MIN", 0.3, "sigma",
@@ -255,15 +292,17 @@ FIXED_PULL_MIN = TABLE.derived(
 
 # What stays in place, in fixed_parts.py
 
-FIXED_MOVE_PX_MIN = TABLE.stated(
+FIXED_MOVE_PX_MIN = TABLE.measured(
     "FIXED_MOVE_PX_MIN", 0.8, "px",
-    "Drift from which on two images are compared: less of it hardly changes a picture with details of some "
-    "pixels.",
+    "Drift from which on two images are compared: less of it hardly changes a picture with details of some pixels. "
+    "1.5 times as large, 1 of 25 cases is decided otherwise; as small, errors change by 0.8 %.",
+    command=TRIED,
 )
-FIXED_SQUARE_PX = TABLE.stated(
+FIXED_SQUARE_PX = TABLE.measured(
     "FIXED_SQUARE_PX", 5, "px",
-    "Side of the squares over which squared differences are summed: about the least detail that is worth leaving "
-    "out.",
+    "Side of the squares over which squared differences are summed: about the least detail that is worth leaving out. "
+    "1.5 times as large or as small, 25 cases are decided alike, and errors change by 0.3 % at most.",
+    command=TRIED,
 )
 FIXED_RATIO_MIN = TABLE.derived(
     "FIXED_RATIO_MIN", 8.0, "ratio of sums",
@@ -271,41 +310,54 @@ FIXED_RATIO_MIN = TABLE.derived(
     "chance (F distribution). Differences that are smoothed by interpolation are fewer, and there are many "
     "squares, so that single ones do not count.",
 )
-FIXED_PIXELS_MIN = TABLE.stated(
+FIXED_PIXELS_MIN = TABLE.measured(
     "FIXED_PIXELS_MIN", 9, "px",
-    "Of a body that stays; fewer are chance among the squares of 512 x 512 px.",
+    "Of a body that stays; fewer are chance among the squares of 512 x 512 px. 1.5 times as large or as small, 25 "
+    "cases are decided alike, and errors change by 0.3 % at most.",
+    command=TRIED,
 )
 ROUNDING_VARIANCE = TABLE.derived(
     "ROUNDING_VARIANCE", 1.0 / 6.0, "squared grey levels",
     "Of the difference of two rounded numbers: twice 1/12.",
 )
-FIXED_SHARE_MAX = TABLE.stated(
+FIXED_SHARE_MAX = TABLE.measured(
     "FIXED_SHARE_MAX", 0.3, "of the image",
-    "That may stay: where more does, the shift is not that of the specimen.",
+    "That may stay: where more does, the shift is not that of the specimen. 1.5 times as large or as small, it "
+    "changes nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-FIXED_ENLARGED_PX = TABLE.stated(
+FIXED_ENLARGED_PX = TABLE.measured(
     "FIXED_ENLARGED_PX", 2, "px",
-    "By which what stays is enlarged: its soft edge is told by less than its inside.",
+    "By which what stays is enlarged: its soft edge is told by less than its inside. 1.5 times as large or as small, "
+    "25 cases are decided alike, and errors change by 0.2 % at most.",
+    command=TRIED,
 )
-GRADIENTS_SMOOTHED_PX = TABLE.stated(
+GRADIENTS_SMOOTHED_PX = TABLE.measured(
     "GRADIENTS_SMOOTHED_PX", 1.5, "px",
-    "Smoothing before gradients are summed, which noise would dominate.",
+    "Smoothing before gradients are summed, which noise would dominate. 1.5 times as large or as small, 25 cases are "
+    "decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-GRADIENTS_ALLOWED = TABLE.stated(
+GRADIENTS_ALLOWED = TABLE.measured(
     "GRADIENTS_ALLOWED", 2.0, "factor",
-    "Allowed for the noise that is left in the sum of all gradients, which makes the part of what stays look "
-    "smaller.",
+    "Allowed for the noise that is left in the sum of all gradients, which makes the part of what stays look smaller. "
+    "1.5 times as large or as small, 2 cases are decided alike, and errors change by 0.1 % at most.",
+    command=TRIED,
 )
 
 # Torn frames, in torn_frames.py
 
-TORN_LINE_PARTS = TABLE.stated(
+TORN_LINE_PARTS = TABLE.measured(
     "TORN_LINE_PARTS", 4, "parts",
-    "Of a line that are compared each by itself: the digits of a clock change in one or two of them, noise in all.",
+    "Of a line that are compared each by itself: the digits of a clock change in one or two of them, noise in all. "
+    "1.5 times as large or as small, it changes nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-TORN_CHANGES_MIN = TABLE.stated(
+TORN_CHANGES_MIN = TABLE.measured(
     "TORN_CHANGES_MIN", 0.75, "of the parts with noise",
-    "That must have changed before, where a line is old: three of four.",
+    "That must have changed before, where a line is old: three of four. 1.5 times as large or as small, it changes "
+    "nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 TORN_REVERSALS_MIN = TABLE.derived(
     "TORN_REVERSALS_MIN", 0.25, "of the pixels",
@@ -317,9 +369,11 @@ TORN_STEPS_MIN = TABLE.derived(
     "That differ from the one before: noise of 0.7 grey levels and more does it. Of a drawn text, where strokes are a "
     "pixel wide, half do.",
 )
-TORN_LINES_MIN = TABLE.stated(
+TORN_LINES_MIN = TABLE.measured(
     "TORN_LINES_MIN", 4, "lines",
-    "That must be old: fields and pairs of lines that are refreshed by turns have one or two at an edge.",
+    "That must be old: fields and pairs of lines that are refreshed by turns have one or two at an edge. 1.5 times as "
+    "large or as small, it changes nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 TORN_SHARE_MIN = TABLE.derived(
     "TORN_SHARE_MIN", 0.02, "of the lines",
@@ -332,55 +386,74 @@ TORN_CHECKED_LINES = TABLE.cost(
 
 # Overlays, in overlay.py
 
-OVERLAY_TEXT_PX = TABLE.stated(
+OVERLAY_TEXT_PX = TABLE.measured(
     "OVERLAY_TEXT_PX", 9, "px",
-    "Side of the window for text, in which pixels are counted that are the same in two pictures: about a letter.",
+    "Side of the window for text, in which pixels are counted that are the same in two pictures: about a letter. 1.5 "
+    "times as large or as small, 26 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-OVERLAY_LINE_PX = TABLE.stated(
+OVERLAY_LINE_PX = TABLE.measured(
     "OVERLAY_LINE_PX", 21, "px",
-    "Length of the windows for lines: longer than chance makes them, shorter than cross-hairs.",
+    "Length of the windows for lines: longer than chance makes them, shorter than cross-hairs. 1.5 times as large, 1 "
+    "of 26 cases is decided otherwise; as small, 1 of 26 cases is decided otherwise and the error of one case is 127 "
+    "% larger.",
+    command=TRIED,
 )
 OVERLAY_SIGMAS = TABLE.derived(
     "OVERLAY_SIGMAS", 6.0, "sigma of a binomial law",
     "By which there must be more of them than elsewhere: by chance, once in 10^9 on one side of a normal law.",
 )
-OVERLAY_NEAR_MIN = TABLE.stated(
+OVERLAY_NEAR_MIN = TABLE.measured(
     "OVERLAY_NEAR_MIN", 12, "px",
-    "That must be the same in a window, where a normal law describes few numbers badly.",
+    "That must be the same in a window, where a normal law describes few numbers badly. 1.5 times as large, 1 of 25 "
+    "cases is decided otherwise; as small, errors change by less than 0.1 %.",
+    command=TRIED,
 )
-OVERLAY_PIXELS_MIN = TABLE.stated(
+OVERLAY_PIXELS_MIN = TABLE.measured(
     "OVERLAY_PIXELS_MIN", 60, "px",
-    "That must be the same in a picture: less than the shortest scale bar.",
+    "That must be the same in a picture: less than the shortest scale bar. 1.5 times as large or as small, it changes "
+    "nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-OVERLAY_CLIPPED_MIN = TABLE.stated(
+OVERLAY_CLIPPED_MIN = TABLE.measured(
     "OVERLAY_CLIPPED_MIN", 19, "px",
-    "Of OVERLAY_LINE_PX that must be the same where they may be clipped: parts of a specimen are, too, and seldom "
-    "in straight lines.",
+    "Of OVERLAY_LINE_PX that must be the same where they may be clipped: parts of a specimen are, too, and seldom in "
+    "straight lines. 1.5 times as large, the error of one case is 127 % larger; as small, it changes nothing, in 25 "
+    "cases.",
+    command=TRIED,
 )
 OVERLAY_NOISE_MIN = TABLE.derived(
     "OVERLAY_NOISE_MIN", 1.5, "grey levels",
     "Below which pixels are the same by chance: at 1.5, the difference of two is rounded to zero in one of five, "
     "0.5 / (1.5 sqrt(2)) = 0.24 sigma to either side.",
 )
-OVERLAY_SAME_MAX = TABLE.stated(
+OVERLAY_SAME_MAX = TABLE.measured(
     "OVERLAY_SAME_MAX", 0.6, "of the image",
-    "That may be the same: more is a picture that came again.",
+    "That may be the same: more is a picture that came again. 1.5 times as large or as small, it changes nothing in "
+    "25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-OVERLAY_ENLARGED_PX = TABLE.stated(
+OVERLAY_ENLARGED_PX = TABLE.measured(
     "OVERLAY_ENLARGED_PX", 2, "px",
-    "By which an overlay is enlarged: letters have soft edges.",
+    "By which an overlay is enlarged: letters have soft edges. 1.5 times as large or as small, 25 cases are decided "
+    "alike, and errors change by 0.1 % at most.",
+    command=TRIED,
 )
-OVERLAY_FILLED_PX = TABLE.stated(
+OVERLAY_FILLED_PX = TABLE.measured(
     "OVERLAY_FILLED_PX", 21, "px",
-    "Side of the square from which its place is filled, wider than the strokes of letters.",
+    "Side of the square from which its place is filled, wider than the strokes of letters. 1.5 times as large or as "
+    "small, 2 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 
 # What moves by itself, in own_motion.py
 
-APART_PX_MIN = TABLE.stated(
+APART_PX_MIN = TABLE.measured(
     "APART_PX_MIN", 1.5, "px",
-    "By which a body must have moved against the specimen before its pixels are told from those of the ground: "
-    "about a detail of the images.",
+    "By which a body must have moved against the specimen before its pixels are told from those of the ground: about "
+    "a detail of the images. 1.5 times as large, 1 of 25 cases is decided otherwise and the error of one case is 34 % "
+    "smaller; as small, it changes nothing.",
+    command=TRIED,
 )
 BODY_FRAMES_MAX = TABLE.stated(
     "BODY_FRAMES_MAX", 12, "frames",
@@ -390,10 +463,11 @@ BODY_REST_FRAMES = TABLE.cost(
     "BODY_REST_FRAMES", 3, "frames",
     "Without a measurement after each, which takes as long as the drift of a frame without a tool.",
 )
-BODY_SEARCHES = TABLE.stated(
+BODY_SEARCHES = TABLE.measured(
     "BODY_SEARCHES", (1, 3, 6), "frames",
-    "After which a body whose motion is unknown is searched for: a fast one is near only at first, a slow one has "
-    "not moved yet.",
+    "After which a body whose motion is unknown is searched for: a fast one is near only at first, a slow one has not "
+    "moved yet. 1.5 times as large, 1 of 25 cases is decided otherwise; as small, 1 of 25 cases is decided otherwise.",
+    command=TRIED,
 )
 BODY_REST_FRAMES_MAX = TABLE.cost(
     "BODY_REST_FRAMES_MAX", 24, "frames",
@@ -403,13 +477,17 @@ BODY_REACH_PX = TABLE.cost(
     "BODY_REACH_PX", 16, "px",
     "That a body whose motion is not known yet may have moved between two frames.",
 )
-BODY_BEYOND_PX = TABLE.stated(
+BODY_BEYOND_PX = TABLE.measured(
     "BODY_BEYOND_PX", 3.0, "px",
-    "That one may have moved beyond the expected.",
+    "That one may have moved beyond the expected. 1.5 times as large or as small, it changes nothing in 6 cases; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-BODY_MARGIN_PX = TABLE.stated(
+BODY_MARGIN_PX = TABLE.measured(
     "BODY_MARGIN_PX", 10, "px",
-    "Around a body that are compared, too: smoothing and interpolation reach some of them.",
+    "Around a body that are compared, too: smoothing and interpolation reach some of them. 1.5 times as large, errors "
+    "change by 1.0 %; as small, 1 of 6 cases is decided otherwise.",
+    command=TRIED,
 )
 BODY_SMOOTHED_PX = TABLE.stated(
     "BODY_SMOOTHED_PX", 1.0, "px",
@@ -424,9 +502,11 @@ BODY_SQUARE_PX = TABLE.stated(
     "BODY_SQUARE_PX", 3, "px",
     "Side of the squares that agree or not.",
 )
-BODY_PIXELS_MIN = TABLE.stated(
+BODY_PIXELS_MIN = TABLE.measured(
     "BODY_PIXELS_MIN", 40, "px",
-    "That must disagree: single squares are no body.",
+    "That must disagree: single squares are no body. 1.5 times as large or as small, it changes nothing in 6 cases; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 CONFIRMED_SIGMAS = TABLE.derived(
     "CONFIRMED_SIGMAS", 3.0, "sigma",
@@ -440,33 +520,46 @@ BODY_GAP_PX = TABLE.stated(
     "BODY_GAP_PX", 7, "px",
     "Gaps in the outline of a body up to which it is one.",
 )
-TILE_PIXELS_MIN = TABLE.stated(
+TILE_PIXELS_MIN = TABLE.measured(
     "TILE_PIXELS_MIN", 8, "px",
-    "Of a tile that make it count: two for each of its four unknowns, shift, gain and offset.",
+    "Of a tile that make it count: two for each of its four unknowns, shift, gain and offset. 1.5 times as large or "
+    "as small, 4 cases are decided alike, and errors change by 2.6 % at most.",
+    command=TRIED,
 )
-RING_PX = TABLE.stated(
+RING_PX = TABLE.measured(
     "RING_PX", 3, "px",
-    "Width of the ring of the second look: the pixels that were taken for a body reach some 2 px beyond its edge.",
+    "Width of the ring of the second look: the pixels that were taken for a body reach some 2 px beyond its edge. 1.5 "
+    "times as large or as small, 6 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-PART_OF_RING = TABLE.stated(
+PART_OF_RING = TABLE.measured(
     "PART_OF_RING", 0.6, "of the change",
     "By which the ground may have pulled the first look, of what the ring changes. Found by drawn bodies: errors over "
     "sigma are then 0.6 for rough tools, 0.7 for smooth discs and 1.1 for particles (20 measurements of each). The "
     "images do not tell it: what a smaller mask changes goes with the error of tools and discs (correlations of -0.8 "
     "and -0.9), less so with that of particles (-0.5), and leaves two discs of three without a shift; what the ring "
-    "changes beyond its own noise makes the same of all three.",
+    "changes beyond its own noise makes the same of all three. 1.5 times as large or as small, 6 cases are decided "
+    "alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-BODY_FLOOR_PX = TABLE.stated(
+BODY_FLOOR_PX = TABLE.measured(
     "BODY_FLOOR_PX", 0.02, "px",
-    "Errors of interpolation at an edge.",
+    "Errors of interpolation at an edge. 1.5 times as large or as small, 6 cases are decided alike, and errors change "
+    "by less than 0.1 %.",
+    command=TRIED,
 )
-BODY_GAINS = TABLE.stated(
+BODY_GAINS = TABLE.measured(
     "BODY_GAINS", (0.9, 1.1), "ratio of contrasts",
-    "Between which a body shows itself again as bright.",
+    "Between which a body shows itself again as bright. 1.5 times as large, the one case is decided otherwise and "
+    "errors are 11 % larger and errors over sigma are 72 % larger; as small, the one case is decided otherwise and "
+    "errors are 11 % larger and errors over sigma are 72 % larger.",
+    command=TRIED,
 )
-BODY_LEFT_MAX = TABLE.stated(
+BODY_LEFT_MAX = TABLE.measured(
     "BODY_LEFT_MAX", 5.0, "of the noise",
-    "Variance that may be left: more is another body, or one that changes.",
+    "Variance that may be left: more is another body, or one that changes. 1.5 times as large or as small, it changes "
+    "nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 BODY_HALVES_SIGMAS = TABLE.derived(
     "BODY_HALVES_SIGMAS", 4.0, "sigma",
@@ -476,16 +569,20 @@ APART_SIGMAS = TABLE.derived(
     "APART_SIGMAS", 3.0, "sigma",
     "By which it must move otherwise than the ground: by chance one in 90, exp(-3^2 / 2).",
 )
-BODY_SIGMA_PX_MAX = TABLE.stated(
+BODY_SIGMA_PX_MAX = TABLE.measured(
     "BODY_SIGMA_PX_MAX", 0.3, "px",
-    "A larger one is that of something else: a body that turns, two bodies, or a shadow.",
+    "A larger one is that of something else: a body that turns, two bodies, or a shadow. 1.5 times as large or as "
+    "small, it changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Drift that is faster than the frames, in flicker.py
 
-FLICKER_MODES = TABLE.stated(
+FLICKER_MODES = TABLE.measured(
     "FLICKER_MODES", (2, 10), "modes",
-    "The first that is used and the one after the last: the lowest after the line; 15 rows of tiles resolve them.",
+    "The first that is used and the one after the last: the lowest after the line; 15 rows of tiles resolve them. 1.5 "
+    "times as large or as small, 26 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 DENSITY_GAIN_MIN = TABLE.derived(
     "DENSITY_GAIN_MIN", 12.0, "twice the log likelihood",
@@ -501,9 +598,11 @@ MIXED_GAIN_MIN = TABLE.derived(
     "MIXED_GAIN_MIN", 1.0, "twice the log likelihood",
     "That a density must gain beside jitter: one sigma.",
 )
-MOVING_RATIO_MIN = TABLE.stated(
+MOVING_RATIO_MIN = TABLE.measured(
     "MOVING_RATIO_MIN", 2.0, "of the noise",
-    "From which rows clearly move, beside MOVING_SIGMAS.",
+    "From which rows clearly move, beside MOVING_SIGMAS. 1.5 times as large or as small, 25 cases are decided alike, "
+    "and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 MOVING_SIGMAS = TABLE.derived(
     "MOVING_SIGMAS", 2.0, "sigma",
@@ -517,10 +616,12 @@ FLICKER_FRAMES = TABLE.cost(
     "FLICKER_FRAMES", 64, "frames",
     "That are remembered.",
 )
-FLICKER_OUTLIER = TABLE.stated(
+FLICKER_OUTLIER = TABLE.measured(
     "FLICKER_OUTLIER", 20.0, "of the median power",
     "From which a frame is left out: chance makes less of sixteen numbers, an image that is wrong in places makes "
-    "much more.",
+    "much more. 1.5 times as large or as small, it changes nothing in 25 cases; a thousand times or a thousandth of "
+    "it does.",
+    command=TRIED,
 )
 FLICKER_GROWTH = TABLE.derived(
     "FLICKER_GROWTH", 1.5, "of the frames",
@@ -530,14 +631,18 @@ FLICKER_ITERATIONS = TABLE.cost(
     "FLICKER_ITERATIONS", 60, "iterations",
     "Of the fit: amounts are then right to some per cent.",
 )
-FLICKER_SHIFT_MAX = TABLE.stated(
+FLICKER_SHIFT_MAX = TABLE.measured(
     "FLICKER_SHIFT_MAX", 0.1, "of the field",
-    "By which a frame may be shifted: beyond, distortion bends it, too.",
+    "By which a frame may be shifted: beyond, distortion bends it, too. 1.5 times as large or as small, it changes "
+    "nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-POWER_OF_MODE = TABLE.stated(
+POWER_OF_MODE = TABLE.measured(
     "POWER_OF_MODE", 0.9, "of the density",
     "Power of a mode of 1/f noise about its line, times its number: 1 but for the line and the ends. Seen in 4000 "
-    "simulated frames.",
+    "simulated frames. 1.5 times as large or as small, 25 cases are decided alike, and errors change by less than 0.1 "
+    "%.",
+    command=TRIED,
 )
 VARIANCE_OF_MEAN = TABLE.derived(
     "VARIANCE_OF_MEAN", 3.0, "of the density",
@@ -582,9 +687,11 @@ CUBIC_REACH_PX = TABLE.derived(
 
 # Measurements, in measurement.py
 
-SHIFT_FLOOR_PX = TABLE.stated(
+SHIFT_FLOOR_PX = TABLE.measured(
     "SHIFT_FLOOR_PX", 1e-3, "px",
-    "Error of a shift that the scatter of the tiles does not show, 1-sigma: interpolation.",
+    "Error of a shift that the scatter of the tiles does not show, 1-sigma: interpolation. 1.5 times as large or as "
+    "small, 25 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 SHEAR_FLOOR_PX = TABLE.stated(
     "SHEAR_FLOOR_PX", 0.02, "px",
@@ -664,40 +771,51 @@ SERIES_BELOW = TABLE.derived(
     "Below which the difference of exponentials is a series of three terms, whose first neglected one is 1e-11 of "
     "it then.",
 )
-ADAPTATION = TABLE.stated(
+ADAPTATION = TABLE.measured(
     "ADAPTATION", 0.2, "of the logarithm",
-    "By which the process noise changes with an innovation of one unit of excess: some five frames are averaged.",
+    "By which the process noise changes with an innovation of one unit of excess: some five frames are averaged. 1.5 "
+    "times as large or as small, 25 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-INNOVATION_RATIO_MAX = TABLE.stated(
+INNOVATION_RATIO_MAX = TABLE.measured(
     "INNOVATION_RATIO_MAX", 6.0, "of what it should be",
-    "As which a normalised innovation squared counts at most, so that a single outlier raises the process noise "
-    "by no more than exp(0.2 x 5) = 2.7.",
+    "As which a normalised innovation squared counts at most, so that a single outlier raises the process noise by no "
+    "more than exp(0.2 x 5) = 2.7. 1.5 times as large or as small, 25 cases are decided alike, and errors change by "
+    "less than 0.1 %.",
+    command=TRIED,
 )
-MOTION_MIN = TABLE.stated(
+MOTION_MIN = TABLE.measured(
     "MOTION_MIN", 0.02, "sigma of a measurement",
-    "By which process noise moves the drift between two frames at least: less of it has no effect.",
+    "By which process noise moves the drift between two frames at least: less of it has no effect. 1.5 times as large "
+    "or as small, it changes nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-TIME_CONSTANT_FRAMES = TABLE.stated(
+TIME_CONSTANT_FRAMES = TABLE.measured(
     "TIME_CONSTANT_FRAMES", 1.0, "frame intervals",
-    "In which an acceleration decays: with a longer time constant the filter follows a smooth drift more closely, "
-    "and overshoots when a rough one turns.",
+    "In which an acceleration decays: with a longer time constant the filter follows a smooth drift more closely, and "
+    "overshoots when a rough one turns. 1.5 times as large, the error of one case is 40 % smaller; as small, the "
+    "error of one case is 152 % larger, in 25 cases.",
+    command=TRIED,
 )
 ESTIMATED_AFTER = TABLE.cost(
     "ESTIMATED_AFTER", (4, 8, 16), "measurements",
     "After which the process noise is estimated again from all of them.",
 )
-LARGER_SIGMAS = TABLE.stated(
+LARGER_SIGMAS = TABLE.measured(
     "LARGER_SIGMAS", 1.0, "sigma",
     "By which it is taken larger than the likeliest then: of so few measurements, too large an uncertainty is the "
-    "lesser evil.",
+    "lesser evil. 1.5 times as large or as small, 25 cases are decided alike, and errors change by 0.4 % at most.",
+    command=TRIED,
 )
 
 # Hindsight, in smoother.py
 
-MEASUREMENT_COST_MAX = TABLE.stated(
+MEASUREMENT_COST_MAX = TABLE.measured(
     "MEASUREMENT_COST_MAX", 50.0, "chi-square",
-    "As which a measurement counts at most, about twice that of an outlier for shift and shear: a few outliers do "
-    "not decide on the process noise.",
+    "As which a measurement counts at most, about twice that of an outlier for shift and shear: a few outliers do not "
+    "decide on the process noise. 1.5 times as large or as small, it changes nothing in 25 cases; a thousand times or "
+    "a thousandth of it does.",
+    command=TRIED,
 )
 MEASUREMENTS_UNCOUNTED = TABLE.derived(
     "MEASUREMENTS_UNCOUNTED", 2, "measurements",
@@ -711,17 +829,21 @@ LIKELIHOOD_MEASUREMENTS_MIN = TABLE.derived(
     "LIKELIHOOD_MEASUREMENTS_MIN", 4, "measurements",
     "For a likelihood: two beyond those that do not count.",
 )
-DENSITY_LOG_RANGE = TABLE.stated(
+DENSITY_LOG_RANGE = TABLE.measured(
     "DENSITY_LOG_RANGE", (-14.0, 5.0), "logarithm",
-    "Of the density relative to the guess: a likelihood is flat beyond.",
+    "Of the density relative to the guess: a likelihood is flat beyond. 1.5 times as large or as small, 25 cases are "
+    "decided alike, and errors change by 0.1 % at most.",
+    command=TRIED,
 )
 DENSITY_GRID = TABLE.cost(
     "DENSITY_GRID", 9, "densities",
     "At which the highest maximum is looked for; Brent's method refines it.",
 )
-DENSITY_LOG_TOLERANCE = TABLE.stated(
+DENSITY_LOG_TOLERANCE = TABLE.measured(
     "DENSITY_LOG_TOLERANCE", 0.1, "logarithm",
-    "Of the density: far less than what the data can tell.",
+    "Of the density: far less than what the data can tell. 1.5 times as large or as small, 25 cases are decided "
+    "alike, and errors change by 0.1 % at most.",
+    command=TRIED,
 )
 SMOOTHER_BLOCK = TABLE.cost(
     "SMOOTHER_BLOCK", 512, "events",
@@ -735,9 +857,11 @@ SEQUENCE_BLOCK = TABLE.cost(
 
 # The frame time, in frame_time.py
 
-SHEAR_OF_SHIFT_DISTORTED = TABLE.stated(
+SHEAR_OF_SHIFT_DISTORTED = TABLE.measured(
     "SHEAR_OF_SHIFT_DISTORTED", 0.01, "of the shift",
-    "Shear that distortion imitates in images as they come: one of 1 % at the edge of the field.",
+    "Shear that distortion imitates in images as they come: one of 1 % at the edge of the field. 1.5 times as large, "
+    "errors change by 1.3 %; as small, the error of one case is 96 % larger, in 26 cases.",
+    command=TRIED,
 )
 SHEAR_OF_SHIFT_RECTIFIED = TABLE.stated(
     "SHEAR_OF_SHIFT_RECTIFIED", 0.001, "of the shift",
@@ -747,34 +871,44 @@ TIMED_FRAMES_MIN = TABLE.derived(
     "TIMED_FRAMES_MIN", 6, "frames",
     "From two components of each of which five unknowns, T and B, are estimated.",
 )
-TIME_SIGMAS_MIN = TABLE.stated(
+TIME_SIGMAS_MIN = TABLE.measured(
     "TIME_SIGMAS_MIN", 5.0, "sigma",
-    "The estimate is used when it is known to 20 %.",
+    "The estimate is used when it is known to 20 %. 1.5 times as large or as small, it changes nothing in 1 case; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-TIMED_CHI2_MAX = TABLE.stated(
+TIMED_CHI2_MAX = TABLE.measured(
     "TIMED_CHI2_MAX", 6.0, "chi-square over its degrees of freedom",
-    "Residuals that are 2.4 times as large as stated come from something else than noise.",
+    "Residuals that are 2.4 times as large as stated come from something else than noise. 1.5 times as large or as "
+    "small, it changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 BEYOND_SIGMAS = TABLE.derived(
     "BEYOND_SIGMAS", 3.0, "sigma",
     "By which an estimate must be longer than the frame interval to be called so: by chance one in 700.",
 )
-FRAME_SHEAR_FLOOR_PX = TABLE.stated(
+FRAME_SHEAR_FLOOR_PX = TABLE.measured(
     "FRAME_SHEAR_FLOOR_PX", 0.005, "px",
-    "Error of the shear of a frame that a registration does not state.",
+    "Error of the shear of a frame that a registration does not state. 1.5 times as large or as small, the errors of "
+    "one case change by 2.8 % at most.",
+    command=TRIED,
 )
-KEYFRAME_SHEAR_FLOOR_PX = TABLE.stated(
+KEYFRAME_SHEAR_FLOOR_PX = TABLE.measured(
     "KEYFRAME_SHEAR_FLOOR_PX", 0.01, "px",
-    "Error that a registration does not state of which frames are in the mean of a keyframe.",
+    "Error that a registration does not state of which frames are in the mean of a keyframe. 1.5 times as large or as "
+    "small, the errors of one case change by 1.5 % at most.",
+    command=TRIED,
 )
 SHEAR_SCALE_FLOOR = TABLE.stated(
     "SHEAR_SCALE_FLOOR", 0.03, "of the shear",
     "A registration goes to the shear in one linear step, which is wrong by some per cent, depending on the "
     "specimen: in one frame.",
 )
-COMMON_SHEAR_SCALE_FLOOR = TABLE.stated(
+COMMON_SHEAR_SCALE_FLOOR = TABLE.measured(
     "COMMON_SHEAR_SCALE_FLOOR", 0.04, "of the shear",
-    "The same in all frames of the same place.",
+    "The same in all frames of the same place. 1.5 times as large, errors over sigma are 29 % smaller; as small, "
+    "errors over sigma are 34 % larger, in 1 case.",
+    command=TRIED,
 )
 HUBER_SIGMAS = TABLE.derived(
     "HUBER_SIGMAS", 2.45, "sigma",
@@ -784,13 +918,17 @@ REWEIGHTED_MAX = TABLE.cost(
     "REWEIGHTED_MAX", 50, "iterations",
     "Until the weights have converged; they take fewer than ten.",
 )
-CONVERGED_SIGMAS = TABLE.stated(
+CONVERGED_SIGMAS = TABLE.measured(
     "CONVERGED_SIGMAS", 1e-3, "sigma",
-    "The weights have converged when T changes by less than this part of its sigma.",
+    "The weights have converged when T changes by less than this part of its sigma. 1.5 times as large or as small, "
+    "it changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-SCORED_FRAMES = TABLE.stated(
+SCORED_FRAMES = TABLE.measured(
     "SCORED_FRAMES", 5, "frames",
-    "Over which scores are summed: errors of smoothed velocities last for some frames.",
+    "Over which scores are summed: errors of smoothed velocities last for some frames. 1.5 times as large or as "
+    "small, the errors of one case change by less than 0.1 %.",
+    command=TRIED,
 )
 INFORMATION_MIN = TABLE.cost(
     "INFORMATION_MIN", 1e-12, "1 / s^2",
@@ -799,34 +937,48 @@ INFORMATION_MIN = TABLE.cost(
 
 # Pairs of scans, in scan_pairs.py
 
-SEARCHED_TILE_PX = TABLE.stated(
+SEARCHED_TILE_PX = TABLE.measured(
     "SEARCHED_TILE_PX", 64, "px",
-    "Side of the tiles by which scans are searched: large enough for a peak that stands out.",
+    "Side of the tiles by which scans are searched: large enough for a peak that stands out. 1.5 times as large or as "
+    "small, 26 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-COMPARED_TILE_PX = TABLE.stated(
+COMPARED_TILE_PX = TABLE.measured(
     "COMPARED_TILE_PX", 32, "px",
-    "Side of the tiles that are compared pixel by pixel, which are the smaller the less the drift changes within.",
+    "Side of the tiles that are compared pixel by pixel, which are the smaller the less the drift changes within. 1.5 "
+    "times as large, errors are 20 % larger and errors over sigma are 157 % larger and 27 % fewer points are found; "
+    "as small, errors are 21 % larger and errors over sigma are 77 % larger and 141 % more points are found, in 1 "
+    "case.",
+    command=TRIED,
 )
-KNOT_PX = TABLE.stated(
+KNOT_PX = TABLE.measured(
     "KNOT_PX", 48, "px",
-    "Lines from knot to knot, which a row of the smaller tiles tells with ease.",
+    "Lines from knot to knot, which a row of the smaller tiles tells with ease. 1.5 times as large, the one case is "
+    "decided otherwise and errors over sigma are 70 % larger; as small, the one case is decided otherwise and errors "
+    "are 110 % larger and errors over sigma are 62 % smaller.",
+    command=TRIED,
 )
 KNOTS_MAX = TABLE.cost(
     "KNOTS_MAX", 32, "knots",
     "What a minute of solving allows.",
 )
-TILES_SMOOTHED_PX = TABLE.stated(
+TILES_SMOOTHED_PX = TABLE.measured(
     "TILES_SMOOTHED_PX", 1.0, "px",
-    "Smoothing before gradients are taken.",
+    "Smoothing before gradients are taken. 1.5 times as large, errors are 19 % larger and errors over sigma are 21 % "
+    "larger and 6.8 % more points are found; as small, errors are 12 % larger and 11 % fewer points are found, in 1 "
+    "case.",
+    command=TRIED,
 )
 TILE_RIM_PX = TABLE.derived(
     "TILE_RIM_PX", 3, "px",
     "At the edge of a tile that the smoothing spoils: three of its sigmas.",
 )
-COMMON_SLOPE_MIN = TABLE.stated(
+COMMON_SLOPE_MIN = TABLE.measured(
     "COMMON_SLOPE_MIN", 0.3, "of the gradients",
-    "That two tiles must have in common, of all that they have: noise alone has 0.1 by chance in a tile of 26 x "
-    "26 px after that smoothing. In one direction alone, a quarter of it.",
+    "That two tiles must have in common, of all that they have: noise alone has 0.1 by chance in a tile of 26 x 26 px "
+    "after that smoothing. In one direction alone, a quarter of it. 1.5 times as large, errors are 6.1 % larger and "
+    "11 % fewer points are found; as small, errors change by 0.9 % and 2.3 % more points are found, in 1 case.",
+    command=TRIED,
 )
 TILE_VARIANCE_MIN = TABLE.stated(
     "TILE_VARIANCE_MIN", 1e-6, "of the variance",
@@ -840,17 +992,21 @@ ROUNDS_FREE = TABLE.stated(
     "ROUNDS_FREE", 2, "rounds",
     "After which it must begin to stay where it is.",
 )
-STILL_PX = TABLE.stated(
+STILL_PX = TABLE.measured(
     "STILL_PX", 0.003, "px",
-    "Change of the displacement below which it stays where it is.",
+    "Change of the displacement below which it stays where it is. 1.5 times as large or as small, the errors of one "
+    "case change by less than 0.1 %.",
+    command=TRIED,
 )
 SETTLED_SIGMAS = TABLE.stated(
     "SETTLED_SIGMAS", 0.5, "sigma",
     "Within which it may wander where little is known.",
 )
-DISPLACED_LINES_MAX = TABLE.stated(
+DISPLACED_LINES_MAX = TABLE.measured(
     "DISPLACED_LINES_MAX", 0.25, "px per line",
-    "Beyond which scans are not compared: a twentieth of the width in a fifth of a scan.",
+    "Beyond which scans are not compared: a twentieth of the width in a fifth of a scan. 1.5 times as large or as "
+    "small, it changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 LINE_STEPS = TABLE.cost(
     "LINE_STEPS", 4, "steps",
@@ -861,34 +1017,44 @@ SPARSE_PX = TABLE.cost(
     "SPARSE_PX", 8, "px",
     "Between those of a tile over which its place on the slow axis is averaged.",
 )
-COARSE_SIGMA_PX = TABLE.stated(
+COARSE_SIGMA_PX = TABLE.measured(
     "COARSE_SIGMA_PX", 1.0, "px",
-    "1-sigma of a shift that is only searched for.",
+    "1-sigma of a shift that is only searched for. 1.5 times as large or as small, the errors of one case change by "
+    "less than 0.1 %.",
+    command=TRIED,
 )
 FAR_MEDIANS = TABLE.stated(
     "FAR_MEDIANS", 4.0, "of the median",
     "By which tiles may be off.",
 )
-PERIODIC_PEAK_MIN = TABLE.stated(
+PERIODIC_PEAK_MIN = TABLE.measured(
     "PERIODIC_PEAK_MIN", 0.8, "of the highest peak",
-    "Of peaks that may be periods of a lattice.",
+    "Of peaks that may be periods of a lattice. 1.5 times as large or as small, it changes nothing in 1 case; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-BEND_PX = TABLE.stated(
+BEND_PX = TABLE.measured(
     "BEND_PX", 2.0, "px",
-    "That the drift is taken to bend at a knot: far more than tiles tell it to, so that it decides only where no "
-    "tile was measured, and the drift goes on there in a straight line with such an uncertainty.",
+    "That the drift is taken to bend at a knot: far more than tiles tell it to, so that it decides only where no tile "
+    "was measured, and the drift goes on there in a straight line with such an uncertainty. 1.5 times as large or as "
+    "small, the errors of one case change by less than 0.1 %.",
+    command=TRIED,
 )
-FREEDOM_MIN = TABLE.stated(
+FREEDOM_MIN = TABLE.measured(
     "FREEDOM_MIN", 0.02, "of the residual",
-    "Of a tile that the fit leaves it at least: what a knot is told by one tile alone has no residual.",
+    "Of a tile that the fit leaves it at least: what a knot is told by one tile alone has no residual. 1.5 times as "
+    "large or as small, 26 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 ZERO_SIGMA_PX = TABLE.cost(
     "ZERO_SIGMA_PX", 1e-4, "px",
     "1-sigma of the mean over the first scan, which is zero by definition.",
 )
-SAME_PLACE_PX = TABLE.stated(
+SAME_PLACE_PX = TABLE.measured(
     "SAME_PLACE_PX", 0.5, "px",
-    "Corrected scans whose whole images are farther apart are not of the same place.",
+    "Corrected scans whose whole images are farther apart are not of the same place. 1.5 times as large or as small, "
+    "it changes nothing in 1 case; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 INTERPOLATED_PX = TABLE.derived(
     "INTERPOLATED_PX", 1, "px",
@@ -897,46 +1063,62 @@ INTERPOLATED_PX = TABLE.derived(
 
 # Stripes, in stripes.py
 
-STRIPE_STRIPS = TABLE.stated(
+STRIPE_STRIPS = TABLE.measured(
     "STRIPE_STRIPS", 6, "strips",
-    "Of an image beside each other, of whose lines the noise differs and stripes do not.",
+    "Of an image beside each other, of whose lines the noise differs and stripes do not. 1.5 times as large or as "
+    "small, it changes nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-STRIPE_CELLS_MIN = TABLE.stated(
+STRIPE_CELLS_MIN = TABLE.measured(
     "STRIPE_CELLS_MIN", 0.9, "of the cells",
-    "In which a strip agrees with the others in sign, of images that have stripes.",
+    "In which a strip agrees with the others in sign, of images that have stripes. 1.5 times as large or as small, 26 "
+    "cases are decided alike, and errors change by 0.9 % at most.",
+    command=TRIED,
 )
 STRIPE_CELLS_TRIED = TABLE.cost(
     "STRIPE_CELLS_TRIED", 0.65, "of the cells",
     "From which a frame is followed once more without them: one picture of noise in ten. The shift decides.",
 )
-STRIPE_PARTS = TABLE.stated(
+STRIPE_PARTS = TABLE.measured(
     "STRIPE_PARTS", 8, "parts",
-    "Of the length of a strip, which are compared for themselves.",
+    "Of the length of a strip, which are compared for themselves. 1.5 times as large or as small, 25 cases are "
+    "decided alike, and errors change by 0.9 % at most.",
+    command=TRIED,
 )
-STRIPE_SMOOTHED_PX = TABLE.stated(
+STRIPE_SMOOTHED_PX = TABLE.measured(
     "STRIPE_SMOOTHED_PX", 1.0, "px",
-    "Smoothing of what is compared, so that little is left of sharp edges that are interpolated.",
+    "Smoothing of what is compared, so that little is left of sharp edges that are interpolated. 1.5 times as large "
+    "or as small, 25 cases are decided alike, and errors change by 0.9 % at most.",
+    command=TRIED,
 )
-STRIPE_MOVE_PX_MAX = TABLE.stated(
+STRIPE_MOVE_PX_MAX = TABLE.measured(
     "STRIPE_MOVE_PX_MAX", 16.0, "px",
     "By which the specimen has moved since the frame that is compared with, before a later one takes its place: half "
-    "of the period of the widest stripes that pull much.",
+    "of the period of the widest stripes that pull much. 1.5 times as large or as small, it changes nothing in 25 "
+    "cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-STRIPE_SHADING = TABLE.stated(
+STRIPE_SHADING = TABLE.measured(
     "STRIPE_SHADING", 0.25, "of the image",
-    "Over which brightness changes slowly: shading, which pulls little.",
+    "Over which brightness changes slowly: shading, which pulls little. 1.5 times as large or as small, it changes "
+    "nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 STRIPE_CLIP = TABLE.stated(
     "STRIPE_CLIP", 4.0, "sigma",
     "At which the means of lines are clipped, so that a few lines of something else do not look like stripes.",
 )
-STRIPE_PROFILE_MIN = TABLE.stated(
+STRIPE_PROFILE_MIN = TABLE.measured(
     "STRIPE_PROFILE_MIN", 32, "lines",
-    "Below, their variances are hardly known.",
+    "Below, their variances are hardly known. 1.5 times as large or as small, it changes nothing in 25 cases; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-STRIPE_SHARE_MAX = TABLE.stated(
+STRIPE_SHARE_MAX = TABLE.measured(
     "STRIPE_SHARE_MAX", 0.3, "of the squared gradients",
-    "That the means of lines have: of a specimen that shows more, it is what the shift across them is told by.",
+    "That the means of lines have: of a specimen that shows more, it is what the shift across them is told by. 1.5 "
+    "times as large or as small, it changes nothing in 25 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 STRIPE_TRIES = TABLE.cost(
     "STRIPE_TRIES", 3, "frames",
