@@ -22,6 +22,9 @@ from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
 
+# Of the measured rows: each says in how many cases it was tried, and what changed in them (doc/thresholds.md).
+TRIED = "python -m benchmarks.thresholds estimator, 28 November 2026"
+
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
@@ -72,19 +75,23 @@ LOSS_LOST = TABLE.stated(
 
 # Poses, in poses.py
 
-WIDE_RATIO = TABLE.stated(
+WIDE_RATIO = TABLE.measured(
     "WIDE_RATIO", 0.7, "of the distance",
-    "Field width over the distance of the pivot, from which a view counts as a wide one. Noise and distortion "
-    "imitate a few hundredths; a microscope has 0.06 to 0.15 at 100x and 0.5 at 60x with a pivot of 4 mm, a "
-    "photographic lens about 1.",
+    "Field width over the distance of the pivot, from which a view counts as a wide one. Noise and distortion imitate "
+    "a few hundredths; a microscope has 0.06 to 0.15 at 100x and 0.5 at 60x with a pivot of 4 mm, a photographic lens "
+    "about 1. 1.5 times as large or as small, it changes nothing in 9 cases; a thousand times or a thousandth of it "
+    "does.",
+    command=TRIED,
 )
 MIRROR_ROUNDS = TABLE.cost(
     "MIRROR_ROUNDS", 5, "rounds",
     "Of mirroring views. Each follows a fit to the last one, and they end when no view changes.",
 )
-DECREASE_MIN = TABLE.stated(
+DECREASE_MIN = TABLE.measured(
     "DECREASE_MIN", 0.1, "half chi-square",
-    "That makes another pose of a view the better one: what a fit of few steps leaves is less.",
+    "That makes another pose of a view the better one: what a fit of few steps leaves is less. 1.5 times as large or "
+    "as small, 9 cases are decided alike, and errors change by 0.3 % at most.",
+    command=TRIED,
 )
 POSE_STEPS = TABLE.cost(
     "POSE_STEPS", 12, "steps",
@@ -101,31 +108,39 @@ POSE_CORNERS = TABLE.cost(
 
 # Residual field, in residual_field_fit.py
 
-STRENGTHS_PX = TABLE.stated(
+STRENGTHS_PX = TABLE.measured(
     "STRENGTHS_PX", (0.05, 0.3, 2.0, 12.0), "px",
     "Standard deviations of a coefficient that are tried, in a picture of REFERENCE_WIDTH_PX: from less than the "
-    "noise of corners to a camera lens, in steps of six.",
+    "noise of corners to a camera lens, in steps of six. 1.5 times as large or as small, 6 cases are decided alike, "
+    "and errors change by 0.4 % at most.",
+    command=TRIED,
 )
 NO_STRENGTH_PX = TABLE.derived(
     "NO_STRENGTH_PX", 1e-7, "px",
     "A prior this narrow holds the field at zero: 1e-5 of the noise of the best corners, 0.01 px.",
 )
-SMOOTHNESS = TABLE.stated(
+SMOOTHNESS = TABLE.measured(
     "SMOOTHNESS", 4.0, "ratio",
-    "Of the coefficients to their second differences in the image: fields are smooth.",
+    "Of the coefficients to their second differences in the image: fields are smooth. 1.5 times as large or as small, "
+    "6 cases are decided alike, and errors change by 0.3 % at most.",
+    command=TRIED,
 )
-STEADINESS = TABLE.stated(
+STEADINESS = TABLE.measured(
     "STEADINESS", 3.0, "ratio",
-    "Of the coefficients to their differences between neighbours in log g.",
+    "Of the coefficients to their differences between neighbours in log g. 1.5 times as large or as small, 6 cases "
+    "are decided alike, and errors change by 0.2 % at most.",
+    command=TRIED,
 )
 OVERLAP_PX = TABLE.derived(
     "OVERLAP_PX", 1e-4, "px",
     "Prior 1-sigma of the part of a field that the rest of the model describes: a hundredth of the noise of the "
     "best corners, so that this part is left to the model.",
 )
-COEFFICIENTS_IN_G_MAX = TABLE.stated(
+COEFFICIENTS_IN_G_MAX = TABLE.measured(
     "COEFFICIENTS_IN_G_MAX", 5, "coefficients",
-    "A field changes slowly with the magnification.",
+    "A field changes slowly with the magnification. 1.5 times as large or as small, it changes nothing in 6 cases; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 MAGNIFICATIONS_MIN = TABLE.derived(
     "MAGNIFICATIONS_MIN", 4, "magnifications",
@@ -144,38 +159,50 @@ FIELD_GAIN_SIGMAS = TABLE.derived(
     "FIELD_GAIN_SIGMAS", 2.5, "sigma",
     "And in standard errors of the gain: by chance one in 160 (normal, one side).",
 )
-FIELD_SIZE_MIN = TABLE.stated(
+FIELD_SIZE_MIN = TABLE.measured(
     "FIELD_SIZE_MIN", 0.15, "sigma of a corner",
     "Least RMS size of a field at the corners: a smaller one costs more certainty, where there are no corners, than "
-    "it is worth.",
+    "it is worth. 1.5 times as large or as small, it changes nothing in 6 cases; a thousand times or a thousandth of "
+    "it does.",
+    command=TRIED,
 )
-GAINING_PART = TABLE.stated(
+GAINING_PART = TABLE.measured(
     "GAINING_PART", 2.0 / 3.0, "of the magnifications",
-    "That must gain: what is in a few of them only is no distortion of the microscope.",
+    "That must gain: what is in a few of them only is no distortion of the microscope. 1.5 times as large or as "
+    "small, it changes nothing in 6 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Variance components, in variance_components.py
 
-FLAT_RAD = TABLE.stated(
+FLAT_RAD = TABLE.measured(
     "FLAT_RAD", math.radians(5.0), "rad",
     "Tilt up to which a view counts as one from above, 5 degrees: more than that of a specimen on its mount, less "
-    "than tilts that are set on purpose. It shortens the grid by 0.4 %, which shows little of the perspective.",
+    "than tilts that are set on purpose. It shortens the grid by 0.4 %, which shows little of the perspective. 1.5 "
+    "times as large or as small, 9 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 SPREAD_COUNT_MIN = TABLE.derived(
     "SPREAD_COUNT_MIN", 4, "effects",
     "Fewer do not tell their spread: of four, its 1-sigma is 1 / sqrt(2 x 4) = 35 % of it.",
 )
-USUAL_WEIGHT = TABLE.stated(
+USUAL_WEIGHT = TABLE.measured(
     "USUAL_WEIGHT", 0.05, "effects",
-    "Weight of the usual spread against one observed effect: enough to decide where nothing is observed.",
+    "Weight of the usual spread against one observed effect: enough to decide where nothing is observed. 1.5 times as "
+    "large or as small, 9 cases are decided alike, and errors change by 1.0 % at most.",
+    command=TRIED,
 )
-SPREAD_MIN = TABLE.stated(
+SPREAD_MIN = TABLE.measured(
     "SPREAD_MIN", 0.01, "of the usual spread",
-    "Below it, no view shows a spread.",
+    "Below it, no view shows a spread. 1.5 times as large or as small, 9 cases are decided alike, and errors change "
+    "by less than 0.1 %.",
+    command=TRIED,
 )
-SPREAD_MAX = TABLE.stated(
+SPREAD_MAX = TABLE.measured(
     "SPREAD_MAX", 20.0, "of the usual spread",
-    "A larger one is a mistake, and no spread.",
+    "A larger one is a mistake, and no spread. 1.5 times as large or as small, it changes nothing in 9 cases; a "
+    "thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # The bundle adjustment, in bundle_adjustment.py
@@ -184,22 +211,28 @@ FIT_STEPS_MAX = TABLE.cost(
     "FIT_STEPS_MAX", 60, "steps",
     "A guard against endless iteration; the result says where it was reached.",
 )
-POOR_GAIN = TABLE.stated(
+POOR_GAIN = TABLE.measured(
     "POOR_GAIN", 0.25, "of the predicted decrease",
-    "Of a view, below which its quadratic model has failed.",
+    "Of a view, below which its quadratic model has failed. 1.5 times as large or as small, 9 cases are decided "
+    "alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 FOLLOWING_STEPS = TABLE.cost(
     "FOLLOWING_STEPS", 6, "steps",
     "By which the pose of such a view follows a new camera; it has to be near only, and the next step continues "
     "from there.",
 )
-NEGLIGIBLE_CHANGE = TABLE.stated(
+NEGLIGIBLE_CHANGE = TABLE.measured(
     "NEGLIGIBLE_CHANGE", 1e-2, "half chi-square",
-    "Of a view, that does not count as a failure.",
+    "Of a view, that does not count as a failure. 1.5 times as large or as small, 9 cases are decided alike, and "
+    "errors change by less than 0.1 %.",
+    command=TRIED,
 )
-ROTATION_STEP_MAX_RAD = TABLE.stated(
+ROTATION_STEP_MAX_RAD = TABLE.measured(
     "ROTATION_STEP_MAX_RAD", 0.5, "rad",
-    "Of a rotation vector: farther away, the equations say nothing.",
+    "Of a rotation vector: farther away, the equations say nothing. 1.5 times as large or as small, it changes "
+    "nothing in 9 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 ROUNDING_DAMPING = TABLE.stated(
     "ROUNDING_DAMPING", 1e-10, "of the diagonal",
@@ -221,9 +254,11 @@ REMAINING_MAX = TABLE.stated(
     "Of an unknown that is still on its way: far beyond what the last step of a converged fit leaves, some "
     "hundredths.",
 )
-HELD_PART = TABLE.stated(
+HELD_PART = TABLE.measured(
     "HELD_PART", 0.8, "of the prior sigma",
-    "Of a constant, or of a change, beyond which the prior holds it: the data have told less than the prior.",
+    "Of a constant, or of a change, beyond which the prior holds it: the data have told less than the prior. 1.5 "
+    "times as large or as small, it changes nothing in 6 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 NAMED_MAX = TABLE.defined(
     "NAMED_MAX", 5, "names",
@@ -234,10 +269,12 @@ ALONG_LINE_MIN = TABLE.derived(
     "Between a line of the raster and the direction in which a point is known: at 45 degrees, half; below it, a "
     "shift along the line hardly shows.",
 )
-JITTER_LENGTHS = TABLE.stated(
+JITTER_LENGTHS = TABLE.measured(
     "JITTER_LENGTHS", (0.4, 1.5, 6.0, 24.0), "lines",
     "Of correlation, that are tried: hardly more than one line, that of one corner's window, and multiples of it up "
-    "to a quarter of a small picture. Longer ones look like a drift.",
+    "to a quarter of a small picture. Longer ones look like a drift. 1.5 times as large or as small, 9 cases are "
+    "decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 LAG_MAX = TABLE.cost(
     "LAG_MAX", 64, "lines",
@@ -247,22 +284,30 @@ JITTER_GAIN = TABLE.derived(
     "JITTER_GAIN", 9.0, "chi-square",
     "Below which there is no jitter: by chance in one of 370 recordings for each length, one degree of freedom.",
 )
-LAG_PAIRS_MIN = TABLE.stated(
+LAG_PAIRS_MIN = TABLE.measured(
     "LAG_PAIRS_MIN", 20.0, "weight",
-    "Sum of the weights with which a lag is compared.",
+    "Sum of the weights with which a lag is compared. 1.5 times as large or as small, it changes nothing in 9 cases; "
+    "a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-RESERVE_SIZE = TABLE.stated(
+RESERVE_SIZE = TABLE.measured(
     "RESERVE_SIZE", 2, "coefficients",
-    "Zero ones that are added to those that were chosen: what the views leave open of them enters the covariance.",
+    "Zero ones that are added to those that were chosen: what the views leave open of them enters the covariance. 1.5 "
+    "times as large or as small, 6 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-RESERVE_SIZE_MIN = TABLE.stated(
+RESERVE_SIZE_MIN = TABLE.measured(
     "RESERVE_SIZE_MIN", 5, "coefficients",
-    "In all, at least.",
+    "In all, at least. 1.5 times as large or as small, 6 cases are decided alike, and errors change by less than 0.1 "
+    "%.",
+    command=TRIED,
 )
-USUAL_CHANGES = TABLE.stated(
+USUAL_CHANGES = TABLE.measured(
     "USUAL_CHANGES", 0.5, "coefficients",
-    "Weight of the usual size of the changes of a function, against one that the views determine: two of them make "
-    "it half as large at the least, so that few magnifications which happen to agree do not promise too much.",
+    "Weight of the usual size of the changes of a function, against one that the views determine: two of them make it "
+    "half as large at the least, so that few magnifications which happen to agree do not promise too much. 1.5 times "
+    "as large or as small, 6 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 CHANGE_FALLS = TABLE.defined(
     "CHANGE_FALLS", (1.0, 0.84, 0.71, 0.59, 0.5, 0.42, 0.35, 0.3, 0.25), "per order",
@@ -273,9 +318,11 @@ FALL_DOUBT = TABLE.derived(
     "FALL_DOUBT", 2.0, "half chi-square",
     "Two standard deviations of what the evidence tells: the slowest fall within them is taken.",
 )
-CHANGE_LIMITS = TABLE.stated(
+CHANGE_LIMITS = TABLE.measured(
     "CHANGE_LIMITS", (0.1, 3.0), "of the usual size",
-    "Of the changes.",
+    "Of the changes. 1.5 times as large or as small, it changes nothing in 6 cases; a thousand times or a thousandth "
+    "of it does.",
+    command=TRIED,
 )
 CHANGE_UPDATES = TABLE.cost(
     "CHANGE_UPDATES", 5, "updates",
@@ -299,10 +346,12 @@ SPREAD_STEP_MAX = TABLE.cost(
 
 # A tilt that all views share, in common_tilt.py
 
-ALIKE_FORESHORTENING = TABLE.stated(
+ALIKE_FORESHORTENING = TABLE.measured(
     "ALIKE_FORESHORTENING", 0.02, "relative",
     "Spread of what tilts shorten views by, below which they may not tell the tilt that is common to them. Where they "
-    "do, next to nothing is added: it costs time only to be too large.",
+    "do, next to nothing is added: it costs time only to be too large. 1.5 times as large or as small, it changes "
+    "nothing in 5 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 COMMON_TILT_CONFIDENCE = TABLE.derived(
     "COMMON_TILT_CONFIDENCE", 0.99, "chance",
