@@ -242,9 +242,11 @@ NOTHING_DECREASE = TABLE.derived(
     "NOTHING_DECREASE", 1e-5, "half chi-square",
     "Of a step that changes nothing: it moves an unknown by 0.0045 of its sigma, sqrt(2 x 1e-5).",
 )
-COST_TOLERANCE = TABLE.stated(
+COST_TOLERANCE = TABLE.measured(
     "COST_TOLERANCE", 1e-7, "of the cost",
-    "Decrease below which another step does not matter to the result.",
+    "Decrease below which another step does not matter to the result. 1.5 times as large or as small, 10 cases are "
+    "decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 
 # The posterior, in posterior.py
