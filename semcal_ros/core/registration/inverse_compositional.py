@@ -357,6 +357,18 @@ class _Comparison:
         squares = residuals_at_gradients(self.level, self.window, self.plain, gain)
         return _expect_variances(self, squares)
 
+    @cached_property
+    def tile_information(self) -> Array:
+        """(tiles, 2, 2) each tile's part of the information: its gradients without those of the noise, which are spread
+        evenly and have no part in what the two images have in common.
+        """
+        return _tile_information(self)
+
+    @cached_property
+    def ratio_of_contrasts(self) -> float:
+        """Standard deviation of the image within its tiles over that of the reference with its noise."""
+        return _ratio_of_contrasts(self.geometry, self.sums, self.noise)
+
     def weighs_alike(self, window: TileWindow, weights: Array | None) -> bool:
         """Whether the tiles of a window are those of this comparison, with the same weights."""
         return (
@@ -769,7 +781,7 @@ def _summarise(
     pixels = float(whole[3, 3])
     error = float(squared_residuals(comparison.geometry, comparison.sums, fit).sum())
     gain = float(fit.gain[0])
-    weights = _tile_information(comparison)
+    weights = comparison.tile_information
     difference, variance = _compare_halves(comparison, covariance, weights)
     joint, joint_covariance, left = _fit_shear(comparison, weights)
     factor = level.factor
@@ -803,9 +815,7 @@ def _overlap_fraction(reference: tuple[int, int], image: tuple[int, int], shift:
 
 
 def _tile_information(comparison: _Comparison) -> Array:
-    """(tiles, 2, 2) each tile's part of the information: its gradients without those of the noise, which are spread
-    evenly and have no part in what the two images have in common.
-    """
+    """As :attr:`_Comparison.tile_information`."""
     geometry, information = comparison.geometry, comparison.fit.information
     gradients = geometry.normal_matrices[:, :2, :2] * np.outer(
         geometry.gradient_share, geometry.gradient_share
@@ -899,7 +909,7 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     rows, cols = len(comparison.window.y), len(comparison.window.x)
     elements = [
         matrices.reshape(-1, 4)[:, [0, 1, 3]]
-        for matrices in (comparison.expected_variances, _tile_information(comparison))
+        for matrices in (comparison.expected_variances, comparison.tile_information)
     ]
     planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
     # Of a specimen that turns, the halves differ.
@@ -980,7 +990,7 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     if min(len(window.x), len(window.y)) < SHEAR_ROWS_MIN:
         return None
     width, height = (factor * n for n in comparison.image_size)
-    weights = _tile_information(comparison)
+    weights = comparison.tile_information
     x, y = np.tile(window.x, len(window.y)), np.repeat(window.y, len(window.x))
     powers = np.stack([np.ones_like(y), y, x], axis=1)
     pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 9)
@@ -1022,8 +1032,11 @@ def _is_more_than_chance(
     whole = (gradients.T @ pairs).reshape(2, 2, count, count)
     energy = whole.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count) * np.outer(scale, scale)
     pixels = max(float(geometry.total[3, 3]), 1.0)
-    contrast = _ratio_of_contrasts(geometry, comparison.sums, comparison.noise)
-    chance = CHANCE_SIGMAS * contrast * np.sqrt(shared_pixels(level.sigma_px) / pixels)
+    chance = (
+        CHANCE_SIGMAS
+        * comparison.ratio_of_contrasts
+        * np.sqrt(shared_pixels(level.sigma_px) / pixels)
+    )
     values, vectors = np.linalg.eigh(information)
     by_chance = chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
     return bool(np.all(values > by_chance))
