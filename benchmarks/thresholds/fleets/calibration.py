@@ -70,9 +70,7 @@ class Drawn:
 
 def draw() -> dict[str, Any]:
     """Name the microscopes, whose corners are drawn in no time, and draw the views on the stage."""
-    cases: dict[str, Any] = {
-        f"microscope {index}": Drawn("judge", index) for index in (*MICROSCOPES, MISSTATED)
-    }
+    cases: dict[str, Any] = {f"microscope {n}": Drawn("judge", n) for n in MICROSCOPES}
     cases[f"microscope {MISSTATED}"] = Drawn("misstate", MISSTATED)
     views = _see(MICROSCOPE.camera_at, VISITS, 1)
     model = _calibrate(views).model

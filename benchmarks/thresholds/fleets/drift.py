@@ -198,23 +198,7 @@ def run(case: Stream | Turned) -> Answer:
 
 def _camera(zoom: float) -> ScanCamera:
     """One without distortion, whose scale may miss."""
-    middle = 0.5 * (SIZE - 1)
-    camera = ScanCamera(
-        magnification=1000.0 * zoom,
-        m=zoom / PX_M,
-        aspect=1.0,
-        skew=0.0,
-        px=middle,
-        py=middle,
-        rho=0.0,
-        xi_r=0.0,
-        xi_t=0.0,
-        ex=middle,
-        ey=middle,
-        norm_px=0.5 * SIZE,
-        width=SIZE,
-        height=SIZE,
-    )
+    camera = ScanCamera.nominal(1000.0 * zoom, SIZE, SIZE, 1000.0 * SIZE * PX_M)
     covariance = np.zeros((len(camera.names),) * 2)
     covariance[0, 0] = (SCALE_SIGMA * camera.m) ** 2
     return replace(camera, covariance=covariance)
@@ -224,7 +208,10 @@ def _track(case: Stream) -> Answer:
     start = time.process_time()
     history = DriftHistory() if case.look_at in ("hindsight", "pass") else None
     tracker = DriftTracker(history=history)
-    cameras = [None if case.zooms is None else _camera(zoom) for zoom in _zooms(case)]
+    cameras: list[ScanCamera | None] = [None] * len(case.frames)
+    unit = 1.0
+    if case.zooms is not None:
+        cameras, unit = [_camera(zoom) for zoom in case.zooms.tolist()], 1.0 / PX_M
     frames = zip(case.frames, case.times_s, cameras, strict=True)
     updates = [tracker.update(frame, float(t), camera) for frame, t, camera in frames]
     estimate = None
@@ -235,7 +222,6 @@ def _track(case: Stream) -> Answer:
             estimate = estimate_frame_time(path)
     seconds = time.process_time() - start
     accepted = np.array([u.accepted for u in updates])
-    unit = 1.0 if case.zooms is None else 1.0 / PX_M
     found = np.array([u.drift_m for u in updates]) * unit
     covariances = np.array([u.covariance for u in updates])
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2]) * unit
@@ -258,10 +244,6 @@ def _track(case: Stream) -> Answer:
             sigma = np.sqrt(np.array(own)[:, 2:])
     bits = digest_of(found, covariances, *own, timed, "".join(u.status.name for u in updates))
     return _answer(decision, int(accepted.sum()), error, sigma, bits, seconds)
-
-
-def _zooms(case: Stream) -> Floats:
-    return np.ones(len(case.frames)) if case.zooms is None else case.zooms
 
 
 def _compare(case: Turned) -> Answer:

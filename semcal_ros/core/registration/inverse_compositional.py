@@ -62,6 +62,7 @@ from semcal_ros.core.registration.thresholds import (
     FREEDOM_MIN,
     GAIN_MIN,
     HESSIAN_PIXELS,
+    INFORMATION_KEPT_MIN,
     LOPSIDED_MAX,
     MEDIAN_CHI2,
     NOISE_ROWS_MIN,
@@ -362,7 +363,21 @@ class _Comparison:
         """(tiles, 2, 2) each tile's part of the information: its gradients without those of the noise, which are spread
         evenly and have no part in what the two images have in common.
         """
-        return _tile_information(self)
+        geometry, information = self.geometry, self.fit.information
+        pixels = geometry.normal_matrices[:, 3, 3]
+        evenly = (pixels / pixels.sum())[:, None, None]
+        tiles = float(self.fit.gain[0]) * geometry.gradients
+        values, vectors = np.linalg.eigh(tiles.sum(axis=0) - information)
+        tiles = tiles - evenly * ((vectors * np.maximum(values, 0.0)) @ vectors.T)
+        kept = np.diag(tiles.sum(axis=0))
+        if not np.all(kept > INFORMATION_KEPT_MIN * np.diag(information)):
+            tiles = geometry.gradients
+        scale = np.sqrt(np.diag(information) / np.diag(tiles.sum(axis=0)))
+        tiles = tiles * np.outer(scale, scale)
+        # The products of x and y: those of the common information, spread evenly.
+        tiles[:, 0, 1] += evenly[:, 0, 0] * (information[0, 1] - tiles[:, 0, 1].sum())
+        tiles[:, 1, 0] = tiles[:, 0, 1]
+        return np.asarray(tiles)
 
     @cached_property
     def ratio_of_contrasts(self) -> float:
@@ -466,8 +481,7 @@ def _align(
     chance = _find_chance_gradient(
         comparison.level,
         comparison.geometry,
-        comparison.sums,
-        comparison.noise,
+        comparison.ratio_of_contrasts,
         comparison.fit.information,
         enough,
     )
@@ -589,7 +603,11 @@ def _descend(
         weights[statistics.rows, statistics.cols] = found
     assert latest is not None
     chance = _find_chance_gradient(
-        latest.level, latest.geometry, latest.sums, latest.noise, latest.fit.information, ALL_PIXELS
+        latest.level,
+        latest.geometry,
+        latest.ratio_of_contrasts,
+        latest.fit.information,
+        ALL_PIXELS,
     )
     return chance or (latest, covariance, converged, passes)
 
@@ -631,9 +649,10 @@ def _compare(
     lacks = 0.0 if weights is None else noise
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
-        return _find_chance_gradient(
-            level, geometry, sums, lacks, information, enough
-        ) or Rejection(MatchFailure.UNDETERMINED, _FEATURELESS)
+        contrast = _ratio_of_contrasts(geometry, sums, lacks)
+        return _find_chance_gradient(level, geometry, contrast, information, enough) or Rejection(
+            MatchFailure.UNDETERMINED, _FEATURELESS
+        )
     return _Comparison(
         level, window, geometry, sums, plain, fit, shift, size, image.mean, lacks, weights
     )
@@ -642,22 +661,17 @@ def _compare(
 def _find_chance_gradient(
     level: PyramidLevel,
     geometry: TileGeometry,
-    sums: TileSums,
-    noise: float,
+    contrast: float,
     information: Array,
     enough: int,
 ) -> Rejection[MatchFailure] | None:
-    """Reject images that have no more gradient in common than chance gives, in one direction or all; ``noise`` is the
-    variance that the sums of the reference are without.
+    """Reject images that have no more gradient in common than chance gives, in one direction or all; ``contrast`` is
+    that of the image over that of the reference.
     """
     energy = geometry.total[:2, :2] * np.outer(geometry.gradient_share, geometry.gradient_share)
     pixels = max(min(float(geometry.total[3, 3]), float(enough)), 1.0)
-    # Smoothed noise has fewer independent pixels.
-    chance = np.sqrt(shared_pixels(level.sigma_px) / pixels) * _ratio_of_contrasts(
-        geometry, sums, noise
-    )
     values, vectors = np.linalg.eigh(information)
-    by_chance = CHANCE_SIGMAS * chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
+    by_chance = _by_chance(level, contrast, pixels, energy, vectors)
     if values[0] > by_chance[0]:
         return None
     if values[1] > by_chance[1]:
@@ -665,6 +679,17 @@ def _find_chance_gradient(
     return Rejection(
         MatchFailure.DISSIMILAR, "images differ: no more gradient in common than by chance"
     )
+
+
+def _by_chance(
+    level: PyramidLevel, contrast: float, pixels: float, energy: Array, vectors: Array
+) -> Array:
+    """What two images whose gradients have an ``energy`` (n, n) in the reference have in common by chance at most,
+    along ``vectors`` (n, k).
+    """
+    # Smoothed noise has fewer independent pixels.
+    chance = CHANCE_SIGMAS * contrast * np.sqrt(shared_pixels(level.sigma_px) / pixels)
+    return np.asarray(chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors))
 
 
 def _ratio_of_contrasts(geometry: TileGeometry, sums: TileSums, noise: float) -> float:
@@ -814,27 +839,6 @@ def _overlap_fraction(reference: tuple[int, int], image: tuple[int, int], shift:
     return both / min(reference[0] * reference[1], image[0] * image[1])
 
 
-def _tile_information(comparison: _Comparison) -> Array:
-    """As :attr:`_Comparison.tile_information`."""
-    geometry, information = comparison.geometry, comparison.fit.information
-    gradients = geometry.normal_matrices[:, :2, :2] * np.outer(
-        geometry.gradient_share, geometry.gradient_share
-    )
-    pixels = geometry.normal_matrices[:, 3, 3]
-    evenly = (pixels / pixels.sum())[:, None, None]
-    gain = float(comparison.fit.gain[0])
-    values, vectors = np.linalg.eigh(gain * gradients.sum(axis=0) - information)
-    tiles = gain * gradients - evenly * ((vectors * np.maximum(values, 0.0)) @ vectors.T)
-    if not np.all(np.diag(tiles.sum(axis=0)) > 0.5 * np.diag(information)):
-        tiles = gradients
-    scale = np.sqrt(np.diag(information) / np.diag(tiles.sum(axis=0)))
-    tiles = tiles * np.outer(scale, scale)
-    # The products of x and y: those of the common information, spread evenly.
-    tiles[:, 0, 1] += evenly[:, 0, 0] * (information[0, 1] - tiles[:, 0, 1].sum())
-    tiles[:, 1, 0] = tiles[:, 0, 1]
-    return np.asarray(tiles)
-
-
 def _compare_halves(
     comparison: _Comparison, covariance: Array, weights: Array
 ) -> tuple[Array, Array]:
@@ -872,20 +876,16 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, A
     """
     rows, cols = len(comparison.window.y), len(comparison.window.x)
     # The shift is the same for all tiles of a row.
-    by_row = np.add.reduce(weights.reshape(rows, cols, 2, 2), axis=1)
+    by_row, gradients = (
+        np.add.reduce(matrices.reshape(rows, cols, 2, 2), axis=1)
+        for matrices in (weights, comparison.geometry.gradients)
+    )
     powers = np.stack([np.ones(rows), comparison.window.y], axis=1)
-    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 4)
-    whole = (by_row.reshape(-1, 4).T @ pairs).reshape(2, 2, 2, 2)
-    information = whole.transpose(2, 0, 3, 1).reshape(4, 4)
-    scaled, scale = equilibrate(information)
-    each = np.repeat(powers, cols, axis=0)
-    if (
-        rows < SHEAR_ROWS_MIN
-        or not _well_conditioned(scaled)
-        or not _is_more_than_chance(comparison, each, scaled, scale)
-    ):
+    inverse = None
+    if rows >= SHEAR_ROWS_MIN:
+        inverse = _invert_information(comparison, by_row, gradients, powers)
+    if inverse is None:
         return np.full(4, np.nan), np.full((4, 4), np.inf), comparison.fit.scores
-    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = comparison.fit.scores.reshape(rows, cols, 2)
     step = -inverse @ (powers.T @ np.add.reduce(scores, axis=1)).ravel()
     joint = np.append(comparison.shift + step[:2], step[2:])
@@ -894,6 +894,7 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, A
     explained = weights.reshape(rows, cols, 2, 2) @ steps[:, None, :, None]
     residual = scores + explained[..., 0]
     tilted = np.concatenate([residual, powers[:, 1, None, None] * residual], axis=2)
+    each = np.repeat(powers, cols, axis=0)
     covariance = _robust_covariance(comparison, tilted.reshape(-1, 4), inverse, each)
     return joint, covariance, residual.reshape(-1, 2)
 
@@ -953,6 +954,36 @@ def _chi_squares(sums: Array) -> Array:
     return np.where(good, chi2, 0.0)
 
 
+def _invert_information(
+    comparison: _Comparison, matrices: Array, gradients: Array, powers: Array
+) -> Array | None:
+    """(2 p, 2 p) inverse of the information on the p terms of shifts whose ``powers`` are (n, p), of which ``matrices``
+    (n, 2, 2) are the information and ``gradients`` (n, 2, 2) the products of the reference's gradients; None where a
+    term is told by no more than noise in the gradients gives by chance.
+
+    Of one edge, which a change of the scale moves nearly as a shift and a shear do, it has little but noise.
+    """
+    scaled, scale = equilibrate(_sum_over_powers(matrices, powers))
+    if not _well_conditioned(scaled):
+        return None
+    both = np.outer(scale, scale)
+    pixels = max(float(comparison.geometry.total[3, 3]), 1.0)
+    energy = _sum_over_powers(gradients, powers) * both
+    values, vectors = np.linalg.eigh(scaled)
+    contrast = comparison.ratio_of_contrasts
+    if np.any(values <= _by_chance(comparison.level, contrast, pixels, energy, vectors)):
+        return None
+    return np.asarray(np.linalg.inv(scaled) * both)
+
+
+def _sum_over_powers(matrices: Array, powers: Array) -> Array:
+    """(2 p, 2 p) sum of matrices (n, 2, 2) of shifts times the products of their ``powers`` (n, p)."""
+    count = powers.shape[1]
+    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(len(powers), -1)
+    whole = (matrices.reshape(-1, 4).T @ pairs).reshape(2, 2, count, count)
+    return np.asarray(whole.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count))
+
+
 def _well_conditioned(matrix: Array) -> bool:
     """Whether the eigenvalues of a symmetric matrix are not too different."""
     values = np.abs(np.linalg.eigvalsh(matrix))
@@ -993,13 +1024,9 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     weights = comparison.tile_information
     x, y = np.tile(window.x, len(window.y)), np.repeat(window.y, len(window.x))
     powers = np.stack([np.ones_like(y), y, x], axis=1)
-    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(-1, 9)
-    whole = (weights.reshape(-1, 4).T @ pairs).reshape(2, 2, 3, 3)
-    information = whole.transpose(2, 0, 3, 1).reshape(6, 6)
-    scaled, scale = equilibrate(information)
-    if not (_well_conditioned(scaled) and _is_more_than_chance(comparison, powers, scaled, scale)):
+    inverse = _invert_information(comparison, weights, comparison.geometry.gradients, powers)
+    if inverse is None:
         return None
-    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
     scores = (powers[:, :, None] * comparison.fit.scores[:, None, :]).reshape(-1, 6)
     step = -inverse @ scores.sum(axis=0)
     explained = np.einsum("tij,tj->ti", weights, powers @ step.reshape(3, 2))
@@ -1014,32 +1041,6 @@ def _fit_similarity(comparison: _Comparison) -> SimilarityFit | None:
     matrix[2:4, 4:] = factor * aspect * np.array([[0.0, 1.0], [-1.0, 0.0]])
     matrix[4:, 4:] = factor / width * np.array([[0.0, 1.0], [1.0, 0.0]])
     return SimilarityFit(matrix @ step, matrix @ covariance @ matrix.T)
-
-
-def _is_more_than_chance(
-    comparison: _Comparison, powers: Array, information: Array, scale: Array
-) -> bool:
-    """Whether all terms of shifts (tiles, p) ``powers`` are told by more than noise in the gradients gives by chance.
-
-    ``information`` (2 p, 2 p) is that of the terms, scaled by ``scale`` (2 p,). Of one edge, which a change of the
-    scale moves nearly as a shift and a shear do, it has little but noise.
-    """
-    geometry, level = comparison.geometry, comparison.level
-    share = np.outer(geometry.gradient_share, geometry.gradient_share)
-    gradients = (geometry.normal_matrices[:, :2, :2] * share).reshape(-1, 4)
-    count = powers.shape[1]
-    pairs = (powers[:, :, None] * powers[:, None, :]).reshape(len(powers), -1)
-    whole = (gradients.T @ pairs).reshape(2, 2, count, count)
-    energy = whole.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count) * np.outer(scale, scale)
-    pixels = max(float(geometry.total[3, 3]), 1.0)
-    chance = (
-        CHANCE_SIGMAS
-        * comparison.ratio_of_contrasts
-        * np.sqrt(shared_pixels(level.sigma_px) / pixels)
-    )
-    values, vectors = np.linalg.eigh(information)
-    by_chance = chance * np.einsum("ik,ij,jk->k", vectors, energy, vectors)
-    return bool(np.all(values > by_chance))
 
 
 def tile_residual_energies(

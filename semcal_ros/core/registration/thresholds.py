@@ -828,6 +828,11 @@ ROWS_RATIO_MIN = TABLE.derived(
     "From which it is found: that of 10 rows of white noise scatters by a factor of 1.6, exp(sqrt(2 / 9)), and is "
     "so large once in 28 times along an axis (chi-square with 9 degrees of freedom).",
 )
+INFORMATION_KEPT_MIN = TABLE.stated(
+    "INFORMATION_KEPT_MIN", 0.5, "of the common information",
+    "That the gradients of the tiles must keep without those of the noise. Where they do not, as along a direction in "
+    "which a shift is held, the tiles count by their gradients as they are.",
+)
 CHANCE_SIGMAS = TABLE.derived(
     "CHANCE_SIGMAS", 5.0, "sigma",
     "By which the common information must exceed what chance gives: once in 3.5 million images of noise along an "

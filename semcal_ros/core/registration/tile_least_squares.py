@@ -78,11 +78,10 @@ class TileGeometry:
         return level, one
 
     @cached_property
-    def tile_energies(self) -> Array:
-        """(n, 2, 2) products of the gradient, each scaled so that the sums of its squares are one."""
-        own = self.normal_matrices[:, :2, :2]
-        scale = 1.0 / np.sqrt(np.diag(self.total)[:2])
-        return np.asarray(own * np.outer(scale, scale))
+    def gradients(self) -> Array:
+        """(n, 2, 2) products of the gradient, without the part that gain and offset explain."""
+        share = np.outer(self.gradient_share, self.gradient_share)
+        return np.asarray(self.normal_matrices[:, :2, :2] * share)
 
     @property
     def has_constant_gain(self) -> bool:

@@ -35,13 +35,10 @@ from semcal_ros.files.images.metadata import (
 )
 from semcal_ros.files.images.sem_image import VendorSettings
 
+# Of a text with two, the first one counts.
 _NUMBERS = (
-    "CM_MAG",
-    "SM_WD",
-    "SM_SCAN_ROTATION",
-    "CM_ACCEL_VOLT",
-    "CM_ACCEL_VOLTAGE",
-    "SM_MICRON_BAR",
+    *("CM_FIELD_OF_VIEW", "CM_MAG", "SM_MICRON_BAR", "SM_WD", "SM_SCAN_ROTATION"),
+    *("CM_ACCEL_VOLT", "CM_ACCEL_VOLTAGE"),
 )
 # By which a field of view and a magnification may differ: a unit that is lost is a factor of a thousand.
 _CONTRADICTION = 100.0
@@ -93,15 +90,14 @@ def _read_pixel_size(
 ) -> tuple[float, bool, tuple[str, ...]]:
     """Return the pixel size in m, whether it rests on an assumed display width, and notes."""
     words = pairs.get("CM_FIELD_OF_VIEW", "").split()
-    refuse_decimal_commas(path, {"$CM_FIELD_OF_VIEW": words[0] if words else ""})
     field_m = positive(quantity(words[0], "m", default_unit="um")) if words else None
     shown = positive(plain_number(pairs.get("CM_MAG", "")))
     if field_m is not None:
-        by_magnification = USUAL_DISPLAY_WIDTH_M / (shown or USUAL_DISPLAY_WIDTH_M / field_m)
-        if not 1.0 / _CONTRADICTION < field_m / by_magnification < _CONTRADICTION:
+        by_magnification_m = field_m if shown is None else USUAL_DISPLAY_WIDTH_M / shown
+        if not 1.0 / _CONTRADICTION < field_m / by_magnification_m < _CONTRADICTION:
             raise TiffError(
                 f"{path.name}: $CM_FIELD_OF_VIEW is {pairs['CM_FIELD_OF_VIEW'][:40]}, and $CM_MAG {shown:g} is a field "
-                f"of {1e6 * by_magnification:g} um",
+                f"of {1e6 * by_magnification_m:g} um",
                 expected="a field of view in um, or with its unit, that fits the magnification",
                 do="export the image again with its text file",
             )
@@ -155,7 +151,9 @@ def jeol_settings(path: Path, pairs: dict[str, str], size_px: tuple[int, int]) -
         There is neither a field of view, nor a magnification, nor a micron bar; the sizes contradict each other; or
         numbers have decimal commas.
     """
-    refuse_decimal_commas(path, {f"${key}": pairs[key] for key in _NUMBERS if key in pairs})
+    refuse_decimal_commas(
+        path, {f"${key}": pairs[key].partition(" ")[0] for key in _NUMBERS if key in pairs}
+    )
     columns, rows = _read_scan_size(path, pairs, size_px)
     pixel_m, assumed, notes = _read_pixel_size(path, pairs, columns)
     distance_mm = plain_number(pairs.get("SM_WD", ""))
