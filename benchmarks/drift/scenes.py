@@ -295,6 +295,15 @@ def pushed(frame: Frame, k: int, rng: Rng) -> Frame:
     return _polygon(frame, np.stack([x + 26 * np.cos(a), y + 26 * np.sin(a)], axis=1), 0.65)
 
 
+def gripper(frame: Frame, k: int, rng: Rng) -> Frame:
+    """A slender tip at rest in sight, which from the ninth frame on pushes a particle across the field."""
+    y, x = rng.uniform(120, 270), 300.0 - 3.0 * max(k - 8, 0)
+    base = np.array([[SIZE + 20, y - 26], [x + 10, y - 4], [x + 10, y + 4], [SIZE + 20, y + 26]])
+    a = np.linspace(0, 2 * np.pi, 40)
+    frame = _polygon(frame, np.stack([x + 12 * np.cos(a), y + 12 * np.sin(a)], axis=1), 0.7)
+    return _polygon(frame, base, 0.75)
+
+
 def shadow(frame: Frame, k: int, rng: Rng) -> Frame:
     """Of a tool above, soft, over a third of the field."""
     x = 60.0 + 4.0 * k
@@ -413,6 +422,7 @@ KINDS: dict[str, Kind] = {
     "rough tool": Kind(fine, textured_tool),
     "pushed particle": Kind(gold, pushed),
     "pushed over sparse": Kind(sparse, pushed),
+    "gripper over sparse": Kind(sparse, gripper, electrons=15.0),
     "shadow": Kind(gold, shadow),
     "data bar": Kind(gold, data_bar),
     "hum over gold": Kind(gold, hum),

@@ -246,6 +246,28 @@ class DriftFilter:
             state=replay(self.start, events, self.process_noise),
         )
 
+    def widen_pulled(self, measure: Measure, pull: Array) -> DriftFilter:
+        """Widen all measurements so far against the keyframe of ``measure``, which is seen to be pulled by ``pull``
+        (2,): those before were by as much less as their shifts are shorter.
+
+        Measurements that are no longer kept stay as they were.
+        """
+        reach, size = float(np.hypot(*measure.shift[:2])), float(np.hypot(*pull))
+        along = pull / size
+
+        def widened(event: Event) -> Event:
+            if not isinstance(event, Measure) or event.key != measure.key:
+                return event
+            part = min(float(np.hypot(*event.shift[:2])) / reach, 1.0) if reach > 0.0 else 1.0
+            lacks = (part * size) ** 2 - float(along @ event.covariance[:2, :2] @ along)
+            return event.widened(lacks * np.outer(along, along)) if lacks > 0.0 else event
+
+        events = tuple(widened(event) for event in self.log)
+        if all(new is old for new, old in zip(events, self.log, strict=True)):
+            return self
+        state = replay(self.start, events, self.process_noise)
+        return replace(self, log=SharedSequence.of(events), state=state)
+
     def set_flicker(self, flicker: Array) -> DriftFilter:
         """Set the variances (4,) of :attr:`.process_noise.ProcessNoise.flicker`."""
         x, y, vx, vy = flicker.tolist()

@@ -20,15 +20,22 @@ from dataclasses import replace
 
 import numpy as np
 
+from semcal_ros.core.arrays import Array
+from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.gating import OutlierTest, inflate_position, judge_shift
 from semcal_ros.core.drift.matching import Match, RejectedMatch
 from semcal_ros.core.drift.measurement import add_zoom_uncertainty
 from semcal_ros.core.drift.new_keyframes import change_scale
+from semcal_ros.core.drift.operations import Measure
 from semcal_ros.core.drift.own_motion import BodyFrame
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import (
+    COMMON_SIGMAS,
     DISPUTED_SIGMAS,
     INNOVATION_CHI2_MAX,
+    PULLED_SIGMAS,
+    SAYS_NOTHING,
     SMALL_ZOOM,
 )
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
@@ -89,11 +96,45 @@ def use_match(
         measure = zoomed
     # Of two directions, one was the predicted one.
     nis = outcome.nis if along is None else 2.0 * outcome.nis
-    updated = state.filter.update(measure)
+    pull_px = match.registration.alignment.pull_px
+    pull = np.asarray(np.linalg.solve(frame.px_from_unit, pull_px), dtype=np.float64)
+    known = widen_earlier(state.filter, measure, pull)
+    updated = known.update(limit_by_pull(measure, known.state, pull))
     updated = updated.adapt_process_noise(nis, measure.covariance[:2, :2], since_s)
     state = replace(state, filter=updated)
     state = state if match.candidate.rescaled else _look_for_flicker(state, frame, match)
     return _expect(state, frame, match), None
+
+
+def widen_earlier(before: DriftFilter, measure: Measure, pull: Array) -> DriftFilter:
+    """The filter before a measurement whose ``pull`` (2,) is no chance: earlier ones were pulled alike, by less than
+    could be seen.
+    """
+    squared = float(pull @ pull)
+    noise = float(np.trace(measure.covariance[:2, :2])) - squared
+    return before.widen_pulled(measure, pull) if squared > PULLED_SIGMAS**2 * noise else before
+
+
+def limit_by_pull(measure: Measure, drift: DriftState, pull: Array) -> Measure:
+    """The measurement so that what is known after it is no better than its ``pull`` (2,), along that direction.
+
+    What pulls the shift of one frame pulls that of the next one alike: no mean of such frames is better than each. Less
+    than :data:`COMMON_SIGMAS` of the noise is of chance, and differs from frame to frame.
+    """
+    least = float(pull @ pull)
+    if least == 0.0:
+        return measure
+    along = pull / np.sqrt(least)
+    seen = along @ measure.jacobian(drift)[:2]
+    before, noise = seen @ drift.covariance @ seen, along @ measure.covariance[:2, :2] @ along
+    is_common = least > COMMON_SIGMAS**2 * (noise - least)
+    if not is_common or before * noise >= least * (before + noise):
+        return measure
+    widest = noise * SAYS_NOTHING
+    wider = min(before * least / (before - least), widest) if before > least else widest
+    covariance = measure.covariance.copy()
+    covariance[:2, :2] += (wider - noise) * np.outer(along, along)
+    return replace(measure, covariance=covariance)
 
 
 def _look_for_flicker(state: TrackerState, frame: ScanFrame, match: Match) -> TrackerState:

@@ -116,6 +116,21 @@ PULLED_CHI2_MIN = TABLE.derived(
 
 # Belief, in filter_update.py and gating.py
 
+PULLED_SIGMAS = TABLE.derived(
+    "PULLED_SIGMAS", 5.0, "sigma of the noise",
+    "From which a pull is no chance: a square with half of the information has one of 5 sigmas at a chi-square of "
+    "12.7, which one of two such squares exceeds in one of 300 images, 2 exp(-12.7 / 2).",
+)
+COMMON_SIGMAS = TABLE.derived(
+    "COMMON_SIGMAS", 2.0, "sigma of the noise",
+    "From which a pull counts as one of all frames: a square with a tenth of the information has one of 1.3 sigmas at "
+    "the chi-square of chance, 13.8, and only one with a quarter reaches 2.1.",
+)
+SAYS_NOTHING = TABLE.derived(
+    "SAYS_NOTHING", 1e6, "of the variance",
+    "Of a measurement that says nothing beyond what is known: it moves the drift by a millionth of its deviation, and "
+    "the covariance stays far from rounding.",
+)
 DISPUTED_SIGMAS = TABLE.measured(
     "DISPUTED_SIGMAS", 2.0, "sigma",
     "At which a disputed position counts: if it is the right one, the stated sigma covers it twice. 1.5 times as "

@@ -67,8 +67,10 @@ from semcal_ros.core.registration.thresholds import (
     MEDIAN_CHI2,
     NOISE_ROWS_MIN,
     PASSES_MAX,
+    PULL_BODY_MIN,
     PULL_CHI2_MIN,
     PULL_EXCESS_MAX,
+    PULL_RATE,
     PULL_REST_MIN,
     PULL_SIDES,
     REMAINING_PX,
@@ -160,9 +162,10 @@ class Alignment:
         Fraction of the smaller image that both show.
     converged, iterations
         Whether the last step left nothing that matters, and the number of steps.
-    may_be_pulled
-        Whether a part of the image that moves by itself, and was not found to, may pull the shift by more than its
-        1-sigma without that part (:meth:`with_pull`).
+    may_be_pulled, pull_px
+        Whether, beyond chance, a part of the image that moves by itself, and was not found to, may pull the shift by
+        more than its 1-sigma without that part; and (2,) by how much one may, chance or not, which is in the
+        covariance (:meth:`with_pull`).
     """
 
     shift_px: Array
@@ -181,6 +184,7 @@ class Alignment:
     converged: bool
     iterations: int
     may_be_pulled: bool = False
+    pull_px: Array = field(default_factory=lambda: np.zeros(2))
     _comparison: _Comparison | None = field(default=None, repr=False, compare=False)
     _left: Array | None = field(default=None, repr=False, compare=False)
 
@@ -190,7 +194,7 @@ class Alignment:
         """
         if self._comparison is None or self._left is None:
             return self
-        pull = _find_pull(self._comparison, self._left) * self._comparison.level.factor
+        pull, sure = self._comparison.level.factor * _find_pulls(self._comparison, self._left)
         if not np.any(pull):
             return self
         joint = self.joint_covariance.copy()
@@ -199,7 +203,8 @@ class Alignment:
             self,
             covariance=self.covariance + np.outer(pull, pull),
             joint_covariance=joint,
-            may_be_pulled=bool(np.any(pull**2 > np.diag(self.covariance))),
+            pull_px=pull,
+            may_be_pulled=bool(np.any(sure**2 > np.diag(self.covariance))),
         )
 
     def fit_similarity(self) -> SimilarityFit | None:
@@ -899,9 +904,9 @@ def _fit_shear(comparison: _Comparison, weights: Array) -> tuple[Array, Array, A
     return joint, covariance, residual.reshape(-1, 2)
 
 
-def _find_pull(comparison: _Comparison, left: Array) -> Array:
-    """(2,) by how much a part of the image that moves by itself, and was not found to, may pull the shift; 0 where none
-    is seen.
+def _find_pulls(comparison: _Comparison, left: Array) -> Array:
+    """(2, 2) by how much a part of the image that moves by itself, and was not found to, may pull the shift; 0 where
+    none is seen. The first row is of any part, the second one of those that are beyond chance whatever their size.
 
     The scores (tiles, 2) that shift and shear have ``left`` are those of noise where all moves alike. Squares of tiles
     whose scores add up to more than chance may move by themselves. Without one of them, the shift would be another one,
@@ -915,30 +920,38 @@ def _find_pull(comparison: _Comparison, left: Array) -> Array:
     planes = np.concatenate([left, *elements], axis=1).reshape(rows, cols, 8)
     # Of a specimen that turns, the halves differ.
     sides = [n for n in PULL_SIDES if 2 * n <= min(rows, cols)] or [PULL_SIDES[0]]
-    squares = [
+    boxes = [
         cv2.boxFilter(planes, -1, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT)
         for n in sides
     ]
-    sums = np.moveaxis(np.array(squares), -1, 0).reshape(8, len(sides), -1)
+    sums = np.moveaxis(np.array(boxes), -1, 0).reshape(8, len(sides), -1)
     chi2 = _chi_squares(np.ascontiguousarray(sums[:5]))
     # Images are never quite alike: as the least squares scatter, so do larger ones.
     least = chi2[0][chi2[0] > 0.0]
     scatter = median(least) / MEDIAN_CHI2 if least.size else 1.0
-    moves = sums[:, chi2 > PULL_CHI2_MIN * min(max(scatter, 1.0), PULL_EXCESS_MAX)].T
-    if not len(moves):
-        return np.zeros(2)
     whole = comparison.fit.information
+    inverse = invert_symmetric(whole)
+    share = 0.5 * np.tensordot([inverse[0, 0], 2.0 * inverse[0, 1], inverse[1, 1]], sums[5:], 1)
+    # There are few squares with a large part of the information, so that less is chance.
+    few_chi2 = -2.0 * np.log(PULL_RATE * np.clip(share, PULL_BODY_MIN, 1.0) ** 2)
+    chi2 = chi2 / min(max(scatter, 1.0), PULL_EXCESS_MAX)
+    moving = chi2 > np.where(share > PULL_BODY_MIN, few_chi2, PULL_CHI2_MIN)
+    moves = sums[:, moving].T
+    if not len(moves):
+        return np.zeros((2, 2))
     rest = whole - moves[:, [5, 6, 6, 7]].reshape(-1, 2, 2)
-    share = 0.5 * np.einsum("ij,nij->n", invert_symmetric(whole), rest)
-    found = share > PULL_REST_MIN
+    found = 1.0 - share[moving] > PULL_REST_MIN
     if not np.any(found):
-        return np.zeros(2)
+        return np.zeros((2, 2))
     # In units of the whole. Along an edge, the rest may have nothing of the one direction: it says no more of it.
     white = np.linalg.inv(np.linalg.cholesky(whole))
     values, vectors = np.linalg.eigh(white @ rest[found] @ white.T)
     along = np.einsum("nij,ni->nj", vectors, moves[found, :2] @ white.T)
     pulls = np.einsum("nij,nj->ni", vectors, along / np.maximum(values, PULL_REST_MIN))
-    return np.asarray(pulls[int(np.argmax(np.einsum("ni,ni->n", pulls, pulls)))] @ white)
+    squares = np.einsum("ni,ni->n", pulls, pulls)
+    sure = np.where(chi2[moving][found] > PULL_CHI2_MIN, squares, 0.0)
+    largest = [pulls[np.argmax(size)] * bool(np.any(size)) for size in (squares, sure)]
+    return np.array(largest) @ white
 
 
 def _chi_squares(sums: Array) -> Array:

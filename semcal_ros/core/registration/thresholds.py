@@ -849,6 +849,16 @@ PULL_CHI2_MIN = TABLE.derived(
     "From which a square seems to move: of some 500 independent ones, one in 20 images, 500 exp(-18.4 / 2), in "
     "which it widens the covariance by little.",
 )
+PULL_BODY_MIN = TABLE.derived(
+    "PULL_BODY_MIN", 0.15, "of the information",
+    "That a square has if it stands out: in evenly structured pictures one of the largest squares, 11 x 11 of some "
+    "39 x 39 tiles, has no more than 0.08.",
+)
+PULL_RATE = TABLE.derived(
+    "PULL_RATE", 0.05, "of the images",
+    "In which one square of a size that stands out seems to move by chance, at most: there are no more than one over "
+    "its part of the information, and each may at this rate times the square of that part.",
+)
 MEDIAN_CHI2 = TABLE.derived(
     "MEDIAN_CHI2", 1.386, "chi-square, 2 degrees of freedom",
     "The median: 2 log(2).",
