@@ -248,18 +248,20 @@ class DriftFilter:
 
     def widen_pulled(self, measure: Measure, pull: Array) -> DriftFilter:
         """Widen all measurements so far against the keyframe of ``measure``, which is seen to be pulled by ``pull``
-        (2,): those before were by as much less as their shifts are shorter.
+        (2,): those before were by as much less as their shifts are shorter, and all alike, so that together they say no
+        more than one.
 
         Measurements that are no longer kept stay as they were.
         """
         reach, size = float(np.hypot(*measure.shift[:2])), float(np.hypot(*pull))
         along = pull / size
+        count = sum(isinstance(e, Measure) and e.key == measure.key for e in self.log)
 
         def widened(event: Event) -> Event:
             if not isinstance(event, Measure) or event.key != measure.key:
                 return event
             part = min(float(np.hypot(*event.shift[:2])) / reach, 1.0) if reach > 0.0 else 1.0
-            lacks = (part * size) ** 2 - float(along @ event.covariance[:2, :2] @ along)
+            lacks = count * (part * size) ** 2 - float(along @ event.covariance[:2, :2] @ along)
             return event.widened(lacks * np.outer(along, along)) if lacks > 0.0 else event
 
         events = tuple(widened(event) for event in self.log)
