@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     residual_variance,
     variance_factor,
@@ -42,7 +43,7 @@ from semcal_ros.core.calibration.judgement.thresholds import VIEWS_MIN
 from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model, rank_findings
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.solve import JointFit, without_magnification
-from semcal_ros.core.calibration.thresholds import MISFIT_MAX
+from semcal_ros.core.calibration.thresholds import GRID_STRETCH_MAX, MISFIT_MAX
 from semcal_ros.core.calibration.views import GridView, RejectedView, show_lines
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
@@ -93,6 +94,20 @@ def describe_stage(setup: Setup, fit: JointFit) -> dict[str, Any]:
         "lattice_sigma": None if spread.lattice_sigma is None else spread.lattice_sigma.tolist(),
         "line_jitter_px": fit.padded.jitter.sigma_px,
     }
+
+
+def _measure_grid_stretch(fit: JointFit) -> float:
+    """Return by how much the cells of the grid are longer along one axis than along the other, relative.
+
+    A grid looks the same after a quarter turn. Where nothing tells its axes apart, the views have stretches of their
+    own, whose signs mean nothing.
+    """
+    problem, state = fit.adjustment.problem, fit.adjustment.result.state
+    if not problem.shared:
+        return 0.0
+    (common,) = problem.shared_values(state.theta, GRID_NAMES[:1])
+    own = state.lattices[:, 0] if len(state.lattices) else np.zeros(1)
+    return float(np.sqrt(np.mean((common + own) ** 2)))
 
 
 def describe_shares(model: CalibrationModel, parts: CovarianceParts) -> ScaleShares:
@@ -229,6 +244,21 @@ def _name_few_beside(setup: Setup, change: ChangePoint) -> str:
     return f"look first whether {asked}, where there are fewer views than elsewhere; else, "
 
 
+def _name_squares_beside(setup: Setup, change: ChangePoint) -> str:
+    """Say that the squares below a jump are other ones than above, since a wrong size looks alike; else empty."""
+    below, above = (
+        {v.square_m for v in setup.views if v.magnification == g}
+        for g in (change.below, change.above)
+    )
+    if below & above:
+        return ""
+    sizes = (" and ".join(f"{1e6 * m:g} um" for m in sorted(s)) for s in (below, above))
+    return (
+        f"the squares are of {' below, and of '.join(sizes)} above, and a wrong size of either looks the same: check "
+        "them first, since a breakpoint would hide it; only "
+    )
+
+
 def _describe_change(setup: Setup, change: ChangePoint) -> Finding:
     size = f"by {100.0 * change.relative:.2g} +- {100.0 * change.sigma:.1g} %"
     if change.below == change.above:
@@ -239,8 +269,8 @@ def _describe_change(setup: Setup, change: ChangePoint) -> Finding:
         return Finding(text, cost_relative=change.relative, magnification=change.below)
     text = (
         f"the scale seems to jump {size} between magnifications {change.below:g} and {change.above:g}: "
-        f"{_name_few_beside(setup, change)}if the microscope switches its scan range there, calibrate with this "
-        "breakpoint"
+        f"{_name_few_beside(setup, change)}{_name_squares_beside(setup, change)}if the microscope switches its scan "
+        "range there, calibrate with this breakpoint"
     )
     # A smooth curve through a jump is off by half of it on either side.
     return Finding(text, cost_relative=0.5 * change.relative, magnification=change.below)
@@ -264,6 +294,16 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
                 + ("; record more magnifications" if len(setup.magnifications) > 1 else ""),
                 excess_px,
                 magnification=excess_at,
+            )
+        )
+    stretch = _measure_grid_stretch(fit)
+    if stretch > GRID_STRETCH_MAX:
+        findings.append(
+            Finding(
+                f"scale: the cells of the grid seem to be longer along one axis than along the other by "
+                f"{100.0 * stretch:.1f} %, and nm per pixel are those of squares of the same area: check the pitch of "
+                "the grid along both axes",
+                cost_relative=0.5 * stretch,
             )
         )
     change = find_change_point(setup, adjustment)

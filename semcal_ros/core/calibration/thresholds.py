@@ -104,6 +104,11 @@ SPANNED_PART = TABLE.stated(
 
 # Judgement, in judge.py
 
+GRID_STRETCH_MAX = TABLE.derived(
+    "GRID_STRETCH_MAX", 5e-3, "relative",
+    "Of the cells of a grid, along one axis against the other: ten times what lithography makes. Half of it is in nm "
+    "per pixel, 0.25 %, where those of a good calibration are known to 0.1 to 0.2 %.",
+)
 MISFIT_MAX = TABLE.derived(
     "MISFIT_MAX", 1.0 + 3.0 * MISFIT_SIGMA, "sigma of a corner",
     "RMS of the residuals beyond which they are due to the model or the grid: by chance once in 370 (normal, both "

@@ -63,6 +63,23 @@ def test_a_jump_is_suspected_and_said_but_not_applied():
     assert len(result.model.functions["scale"].breaks) == 0
 
 
+@pytest.mark.long
+def test_a_jump_where_the_squares_change_may_be_a_wrong_size_of_them():
+    views = [
+        replace(v, square_m=20e-6 if v.magnification < 3000.0 else 5e-6)
+        for v in grid_views(_camera, CALIBRATED, noise_px=0.05, views=6, seed=2)
+    ]
+    result = calibrate_views(
+        views,
+        image_size=MICROSCOPE.image_size,
+        display_width_m=0.12,
+        options=CalibrationOptions(residual="off"),
+    )
+    (warning,) = [w for w in result.warnings if "jump" in w]
+    assert "squares are of 20 um below, and of 5 um above" in warning
+    assert "a breakpoint would hide it" in warning
+
+
 def _with_views_that_state_315(wrong):
     """Views, and their calibration, where so many of four at 300x state 315x: it alone departs by 5 %."""
     views = grid_views(MICROSCOPE.camera_at, [300.0, 800.0], noise_px=0.05, views=4, seed=2)

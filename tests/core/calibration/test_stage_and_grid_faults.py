@@ -101,6 +101,26 @@ def scale_notes(result):
     return [w for w in result.warnings if w.startswith("scale:")]
 
 
+@pytest.mark.parametrize("percent", [0.0, 0.2, 1.0, pytest.param(3.0, marks=pytest.mark.long)])
+def test_cells_that_are_no_squares_are_said(percent):
+    """Lithography makes 0.05 %; what is seen of the rest is in nm per pixel by half."""
+    wider = np.array([1.0 + percent / 100.0, 1.0])
+    views = [
+        replace(view, board_xy_m=view.board_xy_m / wider)
+        for view in stage_views(
+            MICROSCOPE.camera_at, (500.0, 1000.0, 2000.0, 1000.0), ANY_WAY, most_corners=60
+        )
+    ]
+    said = [w for w in scale_notes(calibrated(views)) if "longer along one axis" in w]
+    if percent < 0.5:
+        assert not said
+        return
+    (warning,) = said
+    size = float(re.search(r"other by ([0-9.]+) %", warning).group(1))
+    # The rest passes for tilts and an aspect ratio.
+    assert 0.5 * percent < size < 1.1 * percent
+
+
 @pytest.mark.parametrize("untilted", ["all", "none", "first"])
 def test_views_that_are_named_untilted_and_tilted_by_the_stage_are_said(untilted):
     views = stage_views(
