@@ -25,8 +25,9 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException
 
+from semcal_ros.calibration import Calibration
 from semcal_ros.core.errors import MicroscopeError
-from semcal_ros.core.wording import counted
+from semcal_ros.core.wording import counted, group_by_kind
 from semcal_ros.nodes.acquisition.run import Progress
 from semcal_ros.nodes.calibration_server import CalibrationServer
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
@@ -35,8 +36,8 @@ from semcal_ros.nodes.common.run import run_node
 # As long as a slow scan may take, and the middleware to find a microscope; after a few seconds the wait is said.
 _FIRST_PICTURE_S, _QUIET_S = 60.0, 3.0
 _POLL_S = 0.1
-# What the target is missed by, or what failed.
-_MISSED = 1
+# What missed the target or failed, and what a signal ended, as shells tell SIGINT.
+_MISSED, _INTERRUPTED = 1, 130
 
 
 class _Acquirer(CalibrationServer):
@@ -48,7 +49,7 @@ class _Acquirer(CalibrationServer):
         self._say = say
         self._ask = ask
         self._ended = False
-        self.exit_status = _MISSED
+        self.exit_status = _INTERRUPTED
         self._timer = self.create_timer(
             _POLL_S, self._end_if_done, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -78,6 +79,21 @@ class _Acquirer(CalibrationServer):
                 f"ended with {views}; the same command with --resume {self.acquisition.recording} goes on"
             )
 
+    def _tell_doubts(self, calibration: Calibration) -> None:
+        """Say on stderr what `semcal calibrate` would say of the same views."""
+        rejected = calibration.statistics.get("rejected_views")
+        extended = self.parameters["extend_to"] > 0.0
+        if isinstance(rejected, int) and rejected > 0 and not extended:
+            named = (
+                f"; `semcal calibrate {self.acquisition.recording}` names "
+                + ("it" if rejected == 1 else "them")
+                if self.acquisition.recording is not None
+                else ""
+            )
+            print(f"rejected: {counted(rejected, 'view')}{named}", file=sys.stderr)
+        for text in group_by_kind(calibration.warnings):
+            print(f"warning: {text}", file=sys.stderr)
+
     def show(self, progress: Progress) -> None:
         """Extend the base class: also on the terminal."""
         super().show(progress)
@@ -93,6 +109,9 @@ class _Acquirer(CalibrationServer):
         except NODE_ERRORS as error:
             print("semcal:", *str(error).split(), file=sys.stderr)
         finally:
+            # A signal has shut the context down.
+            if self.exit_status == _INTERRUPTED and self.context.ok():
+                self.exit_status = _MISSED
             self._ended = True
 
     def _begin_acquisition(self) -> None:
@@ -136,6 +155,7 @@ class _Acquirer(CalibrationServer):
         self._tell_end()
         if self.has_calibration:
             self._say(self.save())
+            self._tell_doubts(self.base_calibration())
         if self.acquisition.reached:
             self.exit_status = 0
 
@@ -156,6 +176,6 @@ def run_acquisition(
 
     Returns
     -------
-    Exit status: 0 if the target is met, 1 if not, 2 if the node cannot start.
+    Exit status: 0 if the target is met, 1 if not, 2 if the node cannot start, 130 after Ctrl-C.
     """
     return run_node(lambda: _Acquirer(say, ask), args, threads=_Acquirer.threads)
