@@ -49,7 +49,7 @@ class _Acquirer(CalibrationServer):
         self._say = say
         self._ask = ask
         self._ended = False
-        self.exit_status = _INTERRUPTED
+        self.exit_status = _MISSED
         self._timer = self.create_timer(
             _POLL_S, self._end_if_done, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -64,6 +64,8 @@ class _Acquirer(CalibrationServer):
 
     def destroy_node(self) -> None:
         """Extend the base class: say how to go on with what Ctrl-C has interrupted, now that it is on the disk."""
+        if not self._ended:
+            self.exit_status = _INTERRUPTED
         super().destroy_node()
         self._tell_end()
 
@@ -109,9 +111,6 @@ class _Acquirer(CalibrationServer):
         except NODE_ERRORS as error:
             print("semcal:", *str(error).split(), file=sys.stderr)
         finally:
-            # A signal has shut the context down.
-            if self.exit_status == _INTERRUPTED and self.context.ok():
-                self.exit_status = _MISSED
             self._ended = True
 
     def _begin_acquisition(self) -> None:
