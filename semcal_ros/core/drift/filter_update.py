@@ -107,7 +107,7 @@ def use_match(
 
 
 def widen_earlier(before: DriftFilter, measure: Measure, pull: Array) -> DriftFilter:
-    """The filter before a measurement whose ``pull`` (2,) is no chance: earlier ones were pulled alike, by less than
+    """The filter before a measurement; where its ``pull`` (2,) is large, earlier ones were pulled alike, by less than
     could be seen.
     """
     squared = float(pull @ pull)

@@ -116,15 +116,15 @@ PULLED_CHI2_MIN = TABLE.derived(
 
 # Belief, in filter_update.py and gating.py
 
-PULLED_SIGMAS = TABLE.derived(
-    "PULLED_SIGMAS", 5.0, "sigma of the noise",
-    "From which a pull is no chance: a square with half of the information has one of 5 sigmas at a chi-square of "
-    "12.7, which one of two such squares exceeds in one of 300 images, 2 exp(-12.7 / 2).",
+PULLED_SIGMAS = TABLE.stated(
+    "PULLED_SIGMAS", 5.0, "sigma of the rest",
+    "From which earlier frames are taken to be pulled, too. The rest is what a measurement has beside the pull; "
+    "against a keyframe of n frames it has n / (n + 1) of the variance of noise and pull, so that against a single "
+    "one 1.4 sigmas of the noise are enough.",
 )
-COMMON_SIGMAS = TABLE.derived(
-    "COMMON_SIGMAS", 2.0, "sigma of the noise",
-    "From which a pull counts as one of all frames: a square with a tenth of the information has one of 1.3 sigmas at "
-    "the chi-square of chance, 13.8, and only one with a quarter reaches 2.1.",
+COMMON_SIGMAS = TABLE.stated(
+    "COMMON_SIGMAS", 2.0, "sigma of the rest",
+    "From which a pull counts as one of all frames: as above, 0.8 sigmas of the noise against a single frame.",
 )
 SAYS_NOTHING = TABLE.derived(
     "SAYS_NOTHING", 1e6, "of the variance",
