@@ -269,7 +269,9 @@ def calibrate_found(
             f"a calibration from {counted(len(collected.views), 'view')} of {counted(count, 'image')} "
             f"({group_reasons(collected.rejected)})",
             expected=f"at least {VIEWS_MIN} views of the grid in different directions, or views whose tilt is known",
-            do="mend what was refused, add views, or say that the grid was not tilted (--untilted all)",
+            do="mend what was refused, add views, or say that the grid was not tilted (--untilted all)"
+            if collected.views
+            else "mend what was refused",
         )
     _check_scale(collected.assignment, collected.found, display_width_m)
     factor = collected.assignment.scale_factor

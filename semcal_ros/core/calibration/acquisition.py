@@ -336,7 +336,10 @@ def propose_visits(
     if plan.largest <= goal.target:
         reason = "the target is met"
     elif left < 1:
-        reason = f"{counted(goal.most_views, 'view')} are all that were allowed"
+        reason = (
+            f"{counted(len(taken), 'view')} of at most {goal.most_views} are taken, "
+            f"and another visit takes {len(goal.tilts_rad)}"
+        )
     elif not plan.visits or plan.visits[-1].largest > (1.0 - ROUND_WORTH) * plan.largest:
         reason = "more views would hardly help"
     first = 1 + max((request.visit for request in taken), default=-1)
