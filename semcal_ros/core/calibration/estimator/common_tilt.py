@@ -22,8 +22,11 @@ between the tilts of two views costs least. Its covariance is that of the tangen
 
 So rho is held at values to either side, and the rest adjusted to each. Each that the views allow counts by what is
 known beforehand of the camera alone, the priors of its unknowns: what the views prefer among them is how
-little their tilts and heights differ, which is no chance where a holder made them equal. The second moment about the
-adjustment is added to its covariance. The estimate stays.
+little their tilts and heights differ, which is no chance where a holder made them equal, and how well they are followed
+by coefficients that were chosen for the camera that was found. The same holds for the cameras of one rho: an aspect
+ratio that changes with magnification stands for tilts that do. So the priors choose among these, too, and all that
+the views allow weighs no more than one unit of their cost. The second moment about the camera that is so
+chosen with the rho of the adjustment is added to the covariance. The estimate stays.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.blocks import Problem
+from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     Adjustment,
     refine,
@@ -69,17 +72,20 @@ def are_tilted_alike(rotations: Array) -> bool:
     return bool(spread < ALIKE_FORESHORTENING**2)
 
 
-def _hold_pivot(problem: Problem, column: int, value: float, ratio: float) -> Problem:
+def _hold_pivot(
+    problem: Problem, column: int, value: float, ratio: float, indifference: float
+) -> Problem:
     """Return the problem with rho held at a value, and with heights that are larger by ``ratio``.
 
-    What is seen of a height is its product with rho, as of a tilt.
+    What is seen of a height is its product with rho, as of a tilt. What the views prefer by ``indifference`` counts as
+    one unit of what is known beforehand.
     """
     means, sigmas = problem.prior_mean.copy(), problem.prior_sigma.copy()
     means[column], sigmas[column] = value, PIVOT_HELD_PART * value
     held = replace(
         problem,
         prior_mean=means,
-        prior_sigma=sigmas,
+        prior_sigma=sigmas / np.sqrt(indifference),
         height_sigma_m=ratio * problem.height_sigma_m,
     )
     effects = problem.effects
@@ -98,34 +104,37 @@ class _Camera:
 
 
 def _walk(adjustment: Adjustment, column: int) -> list[_Camera]:
-    """Return the cameras along the curve, with that of the adjustment; ``column`` is that of rho."""
+    """Return the cameras along the curve, that with the rho of the adjustment first; ``column`` is that of rho."""
     problem, result = adjustment.problem, adjustment.result
-    start = result.state.theta
-    rho = float(start[column])
+    rho = float(result.state.theta[column])
     factor = max(variance_factor(problem, result), 1.0)
     chance = 0.5 * factor * float(chi2.ppf(COMMON_TILT_CONFIDENCE, 3 * len(problem.group)))
     limit = COMMON_TILT_SLACK * chance
     least = float(np.sum(view_costs(problem, result.state)))
     tolerance = PIVOT_TOLERANCE / result.cost
-    allowed = [_Camera(rho, start, theta_cost(problem, start))]
+
+    def refit(near: State, value: float) -> tuple[State, float]:
+        held = _hold_pivot(problem, column, value, rho / value, limit)
+        state = refine(
+            held,
+            refine_poses(held, near, max_iterations=FIT_STEPS_MAX),
+            max_iterations=PIVOT_ITERATIONS,
+            tolerance=tolerance,
+            predicted=tolerance,
+        ).state
+        return state, float(np.sum(view_costs(held, state))) - least
+
+    begin, _ = refit(result.state, rho)
+    allowed = [_Camera(rho, begin.theta, theta_cost(problem, begin.theta))]
     for ratio in (1.0 / PIVOT_RATIO, PIVOT_RATIO):
-        state, value, slope = result.state, rho, np.zeros_like(start)
+        state, value, slope = begin, rho, np.zeros_like(begin.theta)
         unlikely = 0
         for _ in range(PIVOT_STEPS_MAX):
             last, value = (state.theta, value**-2.0), ratio * value
             # What a tilt shortens goes with its square, and that with the inverse square of rho.
             theta = last[0] + slope * (value**-2.0 - last[1])
             theta[column] = value
-            held = _hold_pivot(problem, column, value, rho / value)
-            near = replace(state, theta=theta)
-            state = refine(
-                held,
-                refine_poses(held, near, max_iterations=FIT_STEPS_MAX),
-                max_iterations=PIVOT_ITERATIONS,
-                tolerance=tolerance,
-                predicted=tolerance,
-            ).state
-            rise = float(np.sum(view_costs(held, state))) - least
+            state, rise = refit(replace(state, theta=theta), value)
             cost = theta_cost(problem, state.theta)
             # One that is not at its optimum yet may look unlikely.
             least_cost = min(camera.cost for camera in allowed)
@@ -153,5 +162,5 @@ def common_tilt_covariance(adjustment: Adjustment) -> Array:
     # The values of rho are equally far apart in the logarithm, and the prior is one of rho.
     likely = np.array([np.log(camera.rho) - camera.cost for camera in cameras])
     weight = np.exp(likely - likely.max())
-    apart = np.stack([camera.theta for camera in cameras]) - state.theta
+    apart = np.stack([camera.theta for camera in cameras]) - cameras[0].theta
     return np.asarray(np.einsum("k,ka,kb->ab", weight / weight.sum(), apart, apart))
