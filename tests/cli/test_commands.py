@@ -181,6 +181,7 @@ def test_info_counts(folder, capsys):
     )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_papers_method_runs(tmp_path):
     more = [x for g in (300, 800, 2000, 5000) for x in ("--magnification", g)]

@@ -434,6 +434,7 @@ def test_the_time_of_a_pass_is_seen_and_the_shear_removed(swaying, tmp_path, cap
     assert "--frame-time" in more
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_average_is_made_with_the_time_that_was_seen(swaying, tmp_path, capsys):
     out, command = tmp_path / "seen.tif", ("stack", swaying, "-o")

@@ -76,7 +76,7 @@ def narrow() -> CalibrationResult:
     )
 
 
-@pytest.mark.parametrize("which", ["result", "narrow"])
+@pytest.mark.parametrize("which", ["result", pytest.param("narrow", marks=pytest.mark.long)])
 def test_figures_of_the_calibration_report(
     which: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:

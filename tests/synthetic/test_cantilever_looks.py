@@ -76,6 +76,7 @@ def correlation(texture, lag):
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_substrates_differ_in_their_statistics_and_not_in_brightness():
     shapes = {}
     for kind in SUBSTRATES:

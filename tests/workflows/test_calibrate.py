@@ -69,6 +69,7 @@ def frames():
     return [*made[:5], ("blank", blank, 1000.0), *made[5:]]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_sharing_the_work_changes_nothing(frames):
     counted = []

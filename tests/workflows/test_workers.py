@@ -92,6 +92,7 @@ def test_results_come_in_the_order_of_the_items_from_other_processes(cluster):
     assert len(seen) == 2 and os.getpid() not in seen
 
 
+@pytest.mark.long
 def test_items_are_taken_a_few_at_a_time(cluster):
     taken: list[int] = []
 
@@ -164,6 +165,7 @@ def kill_once(mark: Path, number: int, function: Any, *item: Any) -> Any:
     return function(*item)
 
 
+@pytest.mark.long
 def test_a_command_whose_worker_is_killed_gives_the_same_pictures(
     cluster, frames, tmp_path, monkeypatch
 ):
@@ -213,6 +215,7 @@ def test_a_ball_is_the_same_to_the_last_bit(cluster, monkeypatch):
     assert here.summary() == there.summary()
 
 
+@pytest.mark.long
 def test_corners_are_the_same_to_the_last_bit(cluster):
     rng = np.random.default_rng(1)
     boards = [Board(24.0, turn_deg=8.0, width=128, height=128), Board(20.0, width=128, height=128)]

@@ -447,6 +447,7 @@ def test_what_moves_along_itself_is_no_clamped_beam():
     assert "is it the pusher?" in told["the pusher"][0]
 
 
+@pytest.mark.long
 def test_of_two_parallel_beams_the_one_that_bends_is_measured():
     """Both are alike, at 100 nm per pixel; the lower one bends as a beam that is pushed at its end."""
     pixel_m, length = 100e-9, 150
@@ -619,6 +620,7 @@ def test_a_length_of_less_than_what_is_in_view_is_refused(length_m, told):
     assert "check --length" in str(refused.value)
 
 
+@pytest.mark.long
 def test_a_whole_beam_of_another_length_is_refused_and_a_small_difference_told():
     plan = cantilever_plan(scope(256, 0.4), pushes=(0.0,), magnifications=(8890.0,), seed=2)
     camera, image = plan.microscope.camera_at(8890.0), plan.render(0)
@@ -640,6 +642,7 @@ def test_a_whole_beam_of_another_length_is_refused_and_a_small_difference_told()
     assert any("not 33 um: check the length" in note for note in found.notes)
 
 
+@pytest.mark.long
 def test_a_shape_that_the_beam_does_not_have_is_told_and_in_the_sigma(end_plan, end_images):
     """A loaded beam bends by a third order that a parabola does not have."""
     found, truth = measured(end_plan, shape="parabola", images=end_images)
@@ -679,6 +682,7 @@ def test_the_end_in_view():
     assert np.hypot(*(found.frames[2].tip_px - tip - moved)) < 2.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_both_ends_in_view_give_two_scales():
     plan = cantilever_plan(

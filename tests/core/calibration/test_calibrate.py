@@ -107,6 +107,7 @@ def test_held_out_errors_cover_every_magnification(joint):
     assert [r["held_out_extrapolated"] for r in rows] == [True, *[False] * 5, True]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_discrete_is_good_where_it_was_calibrated_and_worse_between(joint):
     result = _calibrate("jsm820", "discrete")

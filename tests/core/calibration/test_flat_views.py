@@ -28,6 +28,7 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
+from tests.helpers.long_tests import long_but
 
 MICROSCOPE = preset("jsm820")
 # The field is so small that the perspective does not tell a tilt.
@@ -111,7 +112,10 @@ def test_flat_views_are_seen_to_be_flat_and_what_that_is_worth_is_said() -> None
     assert np.all(np.abs(error) < 3.0 * sigma)
 
 
-@pytest.mark.parametrize("tilts", [(0.0, 20.0, 35.0, 20.0), (0.0, 6.0, 7.0, 6.0, 7.0)])
+@pytest.mark.parametrize(
+    "tilts",
+    long_but(lambda tilts: len(tilts) == 4, [(0.0, 20.0, 35.0, 20.0), (0.0, 6.0, 7.0, 6.0, 7.0)]),
+)
 def test_tilted_views_are_not_proposed_as_flat(tilts: tuple[float, ...]) -> None:
     """Six degrees shorten a length by half a per cent, which corners tell well."""
     assert not proposals(calibrated(views(tilts)))
@@ -142,7 +146,11 @@ def slanted(tilt_deg: float, gs: tuple[float, ...], spread_deg: float = 0.0) -> 
 
 
 @pytest.mark.parametrize(
-    ("tilt_deg", "gs"), [(17.0, (500.0, 900.0)), (30.0, (500.0, 900.0)), (17.0, (20000.0, 36000.0))]
+    ("tilt_deg", "gs"),
+    long_but(
+        lambda case: case == (17.0, (500.0, 900.0)),
+        [(17.0, (500.0, 900.0)), (30.0, (500.0, 900.0)), (17.0, (20000.0, 36000.0))],
+    ),
 )
 def test_one_tilt_of_all_views_is_not_told_from_the_aspect_ratio(
     tilt_deg: float, gs: tuple[float, ...]
@@ -179,6 +187,7 @@ def test_one_tilt_is_not_told_from_an_aspect_ratio_that_changes_with_magnificati
         assert np.all(np.array(camera.pixel_size_sigma_m) < 0.08 * truth)
 
 
+@pytest.mark.long
 def test_flat_views_stay_certain_where_the_perspective_shows_that_they_are_flat() -> None:
     _, sigma = relative_errors(calibrated(slanted(0.0, (500.0, 900.0))), 500.0)
     assert np.max(sigma) < 5e-3

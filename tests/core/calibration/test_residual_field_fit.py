@@ -143,6 +143,7 @@ def test_a_microscope_without_such_distortion_is_not_made_worse():
     assert _model_error(on, ordinary) < _model_error(auto, ordinary) + 0.005
 
 
+@pytest.mark.long
 def test_a_field_that_is_not_worthwhile_leaves_no_trace():
     auto, off = calibrated("jsm820"), calibrated("jsm820", CalibrationOptions(residual="off"))
     for name, function in off.model.functions.items():

@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.stage import StageAxis, StageReading
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import GridFaults, SimulatedStage, stage_views
+from tests.helpers.long_tests import long_but
 
 MICROSCOPE = preset("jsm820")
 UPWARDS = (100.0, 500.0, 1500.0, 4000.0, 7000.0, 10000.0)
@@ -101,7 +102,9 @@ def scale_notes(result):
     return [w for w in result.warnings if w.startswith("scale:")]
 
 
-@pytest.mark.parametrize("percent", [0.0, 0.2, 1.0, pytest.param(3.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "percent", long_but(lambda percent: percent in (0.0, 1.0), [0.0, 0.2, 1.0, 3.0])
+)
 def test_cells_that_are_no_squares_are_said(percent):
     """Lithography makes 0.05 %; what is seen of the rest is in nm per pixel by half."""
     wider = np.array([1.0 + percent / 100.0, 1.0])
@@ -298,11 +301,13 @@ def _two_views(factor, rotation_rad):
     ]
 
 
+@pytest.mark.long
 def test_two_views_that_contradict_the_stage_are_refused_for_that():
     with pytest.raises(CalibrationError, match="2 views that contradict the tilt of the stage"):
         calibrated(_two_views(0.8, 0.0), axis=StageAxis(0.2))
 
 
+@pytest.mark.long
 def test_tilts_that_only_an_unusual_scan_explains_are_said():
     """Nothing tells that two views lie otherwise than the stage says, but for what no microscope is like."""
     notes = scale_notes(calibrated(_two_views(0.25, None), axis=StageAxis(0.2)))
@@ -337,6 +342,7 @@ def test_a_stage_that_most_views_contradict_is_left_out_at_once():
     np.testing.assert_array_equal(result.model.at(1500.0).P, plain.model.at(1500.0).P)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_cured", [True, False])
 def test_a_fit_that_fails_with_the_stage_is_made_without_it(monkeypatch, is_cured):
     """As where a scan was turned by 90 degrees for half of the views, and nobody says so."""

@@ -76,6 +76,7 @@ def test_a_few_views_are_enough_for_what_all_magnifications_share(
     assert [entry["views"] for entry in log] == [9]
 
 
+@pytest.mark.long
 def test_the_stated_uncertainty_after_an_update_is_honest(calibrated: CalibrationResult) -> None:
     camera = changed(m=-0.004)
     z = np.concatenate(
@@ -104,6 +105,7 @@ def test_without_ageing_only_what_has_changed_moves(calibrated: CalibrationResul
         )
 
 
+@pytest.mark.long
 def test_a_second_update_continues_from_the_first(calibrated: CalibrationResult) -> None:
     camera = changed(m=0.005)
     first = update(calibrated, camera, 60)

@@ -264,6 +264,7 @@ def test_the_jacobian_by_its_own_parameters_is_that_of_the_projection():
         np.testing.assert_allclose(jacobian[:, :, k] * SIGMAS[k], numeric * SIGMAS[k], atol=1e-6)
 
 
+@pytest.mark.long
 def test_sigma_is_the_scatter_of_pictures_of_other_true_cameras():
     """The estimated map applied to what cameras drawn from the covariance see."""
     camera = with_covariance(CAMERA)

@@ -48,6 +48,7 @@ def true_corners(frame: dict[str, Any], truth: dict[str, Any]) -> Array:
     return xy[np.all((xy > -10) & (xy < 522), axis=1)]
 
 
+@pytest.mark.long
 def test_every_magnification_of_the_grid_recording(reference_data: Path) -> None:
     from rosbags.highlevel import AnyReader
 

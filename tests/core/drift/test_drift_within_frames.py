@@ -211,6 +211,7 @@ def test_a_specimen_that_moves_at_a_zoom_is_found_by_the_next_frame(ratio: float
         assert update.accepted == (k != 5)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_out_and_back_over_many_keyframes_ends_where_it_began() -> None:
     texture, frames, far = Texture(3, 360), 160, 200.0

@@ -88,6 +88,7 @@ def test_a_tool_that_comes_in_does_not_tell_the_drift_along_scratches() -> None:
             assert abs(error @ ACROSS) < 3.5 * max(sigma(update.covariance, ACROSS), 0.02)
 
 
+@pytest.mark.long
 def test_what_is_predicted_along_lines_is_not_taken_for_known_again() -> None:
     """Particles that come in later tell how they move, and not how far the specimen has moved before."""
     frames, drift = scratched(20)

@@ -129,6 +129,7 @@ def test_distortion_turns_with_the_raster():
     assert measure(None)[0].max() > 0.5
 
 
+@pytest.mark.long
 def test_several_pairs_are_solved_together():
     shown, drifts = surface(6), [wandering(np.random.default_rng(k)) for k in range(4)]
     scans = [
