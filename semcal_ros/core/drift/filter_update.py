@@ -23,7 +23,12 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.gating import OutlierTest, inflate_position, judge_shift
+from semcal_ros.core.drift.gating import (
+    OutlierTest,
+    inflate_position,
+    judge_shift,
+    reach_of_drift_px,
+)
 from semcal_ros.core.drift.matching import Match, RejectedMatch
 from semcal_ros.core.drift.measurement import add_zoom_uncertainty
 from semcal_ros.core.drift.new_keyframes import change_scale
@@ -81,7 +86,12 @@ def use_match(
     if sees_again:
         state = state.apply(anywhere).see_again()
     if judged is not None:
-        state = replace(state.inflate(judged), jump=np.outer(innovation, innovation))
+        state = state.inflate(judged)
+    # A picture before it showed another place, so that the prediction was widened: what came as expected may be a jump.
+    far_px = float(np.linalg.norm(frame.px_from_unit @ innovation))
+    is_back = np.any(state.doubt) and far_px > reach_of_drift_px(setup.settings.first_step_px)
+    if judged is not None or is_back:
+        state = replace(state, jump=np.outer(innovation, innovation))
     if along is not None:
         state = replace(state, lines=state.lines.begin_or_go_on(along, state.filter))
     since_s = drift.time_s - state.time_s

@@ -170,7 +170,7 @@ def judge_shift(
     if (is_first or is_outlier) and (x_px > max_jump * width or y_px > max_jump * height):
         reason = f"jump of ({x_px:.0f}, {y_px:.0f}) px: a move of the stage"
         return tests, Rejection(MatchFailure.STAGE_MOVE, reason)
-    is_far = max(x_px, y_px) > REACH_SIGMAS * first_step_px
+    is_far = max(x_px, y_px) > reach_of_drift_px(first_step_px)
     if share < WHOLE_SHARE_MIN and is_far and (is_first or is_outlier):
         reason = f"shift of {100.0 * share:.0f} % of the structure is {np.sqrt(nis):.0f} deviations from the prediction"
         return tests, Rejection(MatchFailure.OUTLIER, reason)
@@ -179,13 +179,18 @@ def judge_shift(
     position = measure.shift[:2] + state.keyframe_state(measure.key)[:2]
     # What moves fast may also turn fast.
     step_px = float(np.hypot(*(frame.px_from_unit @ state.velocity))) * (state.time_s - last_s)
-    reach_px = max(REACH_SIGMAS * first_step_px, step_px)
+    reach_px = max(reach_of_drift_px(first_step_px), step_px)
     reach = np.asarray(reach_px * np.linalg.inv(frame.px_from_unit))
     tests, inflation = tests.explain(state, position, reach, last_s)
     if inflation is None:
         reason = f"shift is {np.sqrt(nis):.0f} deviations from the prediction"
         return tests, Rejection(MatchFailure.OUTLIER, reason)
     return tests, inflation
+
+
+def reach_of_drift_px(first_step_px: float) -> float:
+    """How far drift gets between two frames, px, where its first step has the 1-sigma ``first_step_px``."""
+    return REACH_SIGMAS * first_step_px
 
 
 def inflate_after_pause(speed: float, pause_s: float) -> Inflate:

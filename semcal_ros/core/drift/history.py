@@ -30,6 +30,7 @@ from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import INNOVATION_CHI2_MAX
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.registration.failures import SEEN_AWAY
 
 
 @dataclass
@@ -118,8 +119,9 @@ def _find_doubts(stretch: list[DriftUpdate]) -> list[Array]:
     """(2, 2) what is in doubt of each frame with hindsight, besides the covariance of the path.
 
     Nothing is where a frame after it was matched with the keyframes from before it, and the specimen had come back to
-    where the path expects it. If it had not, nobody knows when it went: the path takes the frames that were not used in
-    between to be where they would be without that.
+    where the path expects it. If it had not, nobody knows when it went, and by which way: the path takes the frames
+    that were not used in between to be where they would be without that. The same holds for a frame that was seen at
+    another place itself.
     """
     doubts: list[Array] = []
     after: Array | None = None
@@ -129,7 +131,12 @@ def _find_doubts(stretch: list[DriftUpdate]) -> list[Array]:
         elif update.accepted:
             after = update.jump
         rests_on_itself = update.accepted and not update.restarted
-        doubts.append(update.doubt if rests_on_itself or after is None else after)
+        if rests_on_itself or after is None:
+            doubts.append(update.doubt)
+        else:
+            is_away = update.rejection is not None and update.rejection.status in SEEN_AWAY
+            is_doubted = is_away or np.any(after)
+            doubts.append(after + update.doubt if is_doubted else after)
     return doubts[::-1]
 
 
@@ -138,9 +145,13 @@ def _contradicts(update: DriftUpdate, smoothed: DriftUpdate) -> bool:
     more differs from the other by no more than that is uncertain (Hausman 1978, doi:10.2307/1913827).
 
     It does so where stamps are wrong: of two frames a millisecond apart by their stamps, which were taken a second
-    apart, the path goes through the middle. It may also lose the digits of a velocity that is not known at all.
+    apart, the path goes through the middle. It may also lose the digits of a velocity or a place that is not known at
+    all.
     """
-    if np.any(np.diag(smoothed.covariance) < 0.0):
+    if (
+        np.any(np.diag(smoothed.covariance) < 0.0)
+        or np.linalg.det(smoothed.covariance[:2, :2]) < 0.0
+    ):
         return True
     apart, covariance = smoothed.drift_m - update.drift_m, update.covariance[:2, :2]
     if not (update.accepted and np.all(np.isfinite(covariance)) and np.any(covariance)):

@@ -28,6 +28,7 @@ from semcal_ros.core.drift.gating import (
     inflate_if_contradicted,
     inflate_position,
     inflate_when_lost,
+    reach_of_drift_px,
 )
 from semcal_ros.core.drift.matching import RejectedMatch
 from semcal_ros.core.drift.measurement import is_removable
@@ -37,12 +38,10 @@ from semcal_ros.core.drift.thresholds import (
 )
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import Rejection
-from semcal_ros.core.registration.failures import IMAGE_FAILURES, MatchFailure
+from semcal_ros.core.registration.failures import IMAGE_FAILURES, SEEN_AWAY, MatchFailure
 
 # What an image looks like that shows another place: the prediction need not hold.
 _ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
-# It matches a keyframe, at an unexpected place: the next one tells whether that holds.
-_SEEN_AWAY = frozenset({MatchFailure.OUTLIER, MatchFailure.STAGE_MOVE})
 
 
 def coast(
@@ -87,13 +86,39 @@ def coast(
             state = state.inflate(contradicted)
     if is_lost:
         return restart(setup, state, frame, rejection)
-    if rescaled and is_of_keyframe and rejection.status not in _SEEN_AWAY:
+    if rescaled and is_of_keyframe and rejection.status not in SEEN_AWAY:
         # What is in doubt now is so for all frames that are registered against this one.
         state = state.inflate(inflate_position(state.doubt))
         return restart(setup, replace(state, doubt=np.zeros((2, 2))), frame, rejection)
     return state, make_update(
         state, frame, DriftStatus.COASTING, rejection, registration=registration
     )
+
+
+def leave_place(
+    setup: TrackerSetup,
+    state: TrackerState,
+    frame: ScanFrame,
+    key: int,
+    rejected: list[RejectedMatch],
+) -> TrackerState:
+    """Return the state before a match with keyframe ``key``, of a frame that did not match a better one before.
+
+    Where it is not known how far the two keyframes are apart, that match alone would tell it, as if the frame had been
+    seen with both. But it does not show the place of the other one: the specimen has moved since the last frame, out of
+    sight.
+    """
+    _, covariance = state.filter.state.predict_shift(key)
+    sigma_px = frame.px_from_unit @ covariance @ frame.px_from_unit.T
+    is_known = (
+        np.linalg.eigvalsh(sigma_px)[-1] <= reach_of_drift_px(setup.settings.first_step_px) ** 2
+    )
+    if is_known or all(one.rejection.status in IMAGE_FAILURES for one in rejected):
+        return state
+    since_s = max(state.filter.state.time_s - state.previous_s, INTERVAL_S_MIN)
+    speed_px_s = setup.settings.first_step_px / since_s
+    out_of_sight_px = float(max(frame.size))
+    return state.inflate(inflate_when_lost(frame.px_from_unit, out_of_sight_px, speed_px_s))
 
 
 def _reach_px(setup: TrackerSetup, frame: ScanFrame) -> float:

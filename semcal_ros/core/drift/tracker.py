@@ -47,7 +47,7 @@ from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.matching import Match, RejectedMatch, free_of_pull, match_keyframe
 from semcal_ros.core.drift.new_keyframes import add_keyframe, renew_keyframe
 from semcal_ros.core.drift.operations import Predict
-from semcal_ros.core.drift.recovery import coast, restart
+from semcal_ros.core.drift.recovery import coast, leave_place, restart
 from semcal_ros.core.drift.remade_keyframes import clean_keyframes
 from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState
@@ -219,6 +219,7 @@ def _follow(
             match = RejectedMatch(_REPEATED_IMAGE, match.registration)
         if isinstance(match, Match):
             state, match = free_of_pull(setup, state, frame, match)
+            state = leave_place(setup, state, frame, match.measure.key, rejected)
             state, refused = use_match(setup, state, frame, match)
             if refused is None:
                 return renew_keyframe(setup, state, frame, match)

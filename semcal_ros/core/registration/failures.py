@@ -59,6 +59,9 @@ IMAGE_FAILURES = frozenset(
     {MatchFailure.UNUSABLE_IMAGE, MatchFailure.REPEATED_IMAGE, MatchFailure.REPEATED_TIME}
 )
 
+#: The image matches, at an unexpected place: the next one tells whether that holds.
+SEEN_AWAY = frozenset({MatchFailure.OUTLIER, MatchFailure.STAGE_MOVE})
+
 #: Failures that stripes in the images may be the cause of.
 STRIPE_FAILURES = frozenset(
     {

@@ -573,6 +573,38 @@ def test_the_first_frame_after_a_step_of_the_stage_is_not_certain_with_hindsight
     assert np.all(np.delete(path.sigma_m[:, 0], 8) < 0.2)
 
 
+def test_where_the_stage_was_while_it_was_away_is_not_known_with_hindsight() -> None:
+    """It begins again there, and comes back: that does not tell how far away it was."""
+    texture = Texture(4)
+    is_away = (np.arange(28) >= 6) & (np.arange(28) < 20)
+    truth = np.array([(0.2 * k, -0.1 * k) for k in range(28)]) + 110.0 * is_away[:, None]
+    views = [noisy(texture.view((x, y), 160), 4.0, k) for k, (x, y) in enumerate(truth.tolist())]
+    updates, _, history = _track(views)
+    assert [k for k, u in enumerate(updates) if u.restarted and u.drift_px.any()] == [13]
+    assert all(u.accepted for u in updates[14:])
+    path = history.smooth()
+    off, sigma = np.abs(path.drift_m - truth), path.sigma_m
+    # One sigma of a place that is lost is a quarter of the field, which is 0.7 of one here.
+    assert np.all(sigma[14:20] > 30.0)
+    assert np.all(off[14:20] < 4.0 * sigma[14:20])
+    assert np.all(off[20:] < 0.1) and np.all(sigma[20:] < 0.1)
+
+
+def test_a_frame_that_was_seen_elsewhere_is_not_certain_with_hindsight() -> None:
+    """Two steps in succession: what the second one leaves agrees with the velocity that the first one may have had."""
+    texture = Texture(4)
+    truth = np.array([0.5 * k for k in range(18)])
+    truth[8:] -= 13.0
+    truth[10] -= 33.0
+    truth[11:] -= 10.0
+    views = [noisy(texture.view((x, 0.0), 192), 4.0, k) for k, x in enumerate(truth.tolist())]
+    updates, _, history = _track(views)
+    assert [k for k, u in enumerate(updates) if not u.accepted] == [8, 10]
+    path = history.smooth()
+    assert np.all(np.abs(path.drift_m[:, 0] - truth) < 3.0 * path.sigma_m[:, 0] + 1e-9)
+    assert np.all(np.delete(path.sigma_m[:, 0], [8, 10]) < 0.2)
+
+
 @pytest.mark.parametrize(
     ("kind", "jump_px", "said"),
     [("tool over gold", 8.0, "ambiguous"), ("two tools", 3.0, "coarse and fine shift differ")],
