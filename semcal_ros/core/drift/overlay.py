@@ -22,8 +22,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from semcal_ros.core.arrays import AnyImage, Mask
+from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.thresholds import (
     OVERLAY_CLIPPED_MIN,
     OVERLAY_ENLARGED_PX,
@@ -32,8 +33,13 @@ from semcal_ros.core.drift.thresholds import (
     OVERLAY_NEAR_MIN,
     OVERLAY_NOISE_MIN,
     OVERLAY_PIXELS_MIN,
+    OVERLAY_QUIET_MAX,
+    OVERLAY_QUIET_SIGMAS,
     OVERLAY_SAME_MAX,
+    OVERLAY_SHARP_MAX,
     OVERLAY_SIGMAS,
+    OVERLAY_STEADY_MAX,
+    OVERLAY_STEP_SIGMAS,
     OVERLAY_TEXT_PX,
 )
 from semcal_ros.core.registration.fixed_pixels import grow_mask
@@ -43,13 +49,16 @@ _WINDOWS = (
     (OVERLAY_LINE_PX, 1),
     (1, OVERLAY_LINE_PX),
 )
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+_NEARBY = np.ones((2 * OVERLAY_TEXT_PX + 1, 2 * OVERLAY_TEXT_PX + 1), np.uint8)
 
 
 def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     """(h, w) True where two pictures of one size show an overlay; None where there is none.
 
     Only pictures of integers tell: floats were computed, and may have lost their noise. It fails on pictures almost
-    without noise, and says then that there is none; letters in the largest or the least grey level are not found.
+    without noise, and says then that there is none. Of what is drawn in the largest or the least grey level, to which
+    a specimen may be clipped, straight lines are found, and shapes whose border noise does not move.
     """
     if before.shape != now.shape or before.dtype.kind not in "iu" or now.dtype.kind not in "iu":
         return None
@@ -62,11 +71,14 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     noise = 1.4826 * float(np.median(np.abs(some))) / np.sqrt(2.0)
     if noise < OVERLAY_NOISE_MIN:
         return None
-    # Of the least and the largest grey level, to which parts of a specimen are clipped, only straight lines count.
-    drawn = same & ((now == now.min()) | (now == now.max()))
+    levels = now.min(), now.max()
+    drawn = same & ((now == levels[0]) | (now == levels[1]))
+    core = np.zeros_like(same)
+    for level in levels:
+        core |= _find_steady_shapes(before, now, int(level), noise)
     same &= ~drawn
     rate = float(same.mean())
-    core, counted = np.zeros_like(same), same.astype(np.uint8)
+    counted = same.astype(np.uint8)
     for window in _WINDOWS:
         pixels = window[0] * window[1]
         expected = pixels * rate + OVERLAY_SIGMAS * np.sqrt(pixels * rate * (1.0 - rate))
@@ -78,6 +90,70 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     if np.count_nonzero(core) < OVERLAY_PIXELS_MIN:
         return None
     return grow_mask(core, OVERLAY_ENLARGED_PX)
+
+
+def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: float) -> Mask:
+    """(h, w) True in shapes of one extreme grey level that no specimen has that is clipped to it.
+
+    Where a specimen is clipped, its border is where a slope crosses the level, which noise shifts from picture to
+    picture by the noise over the slope. The edge of a beam falls the faster, in its logarithm, the farther out it is,
+    so that what is left of the step beside the border limits the slope. A shape that is drawn has the same pixels, and
+    nothing is left of the step beside them; or what is left was mixed with the picture, and has less noise than that.
+    This is asked of all shapes together, of those that are near each other, and of each.
+    """
+    in_both = (before == level) & (now == level)
+    if not np.any(in_both):
+        return in_both
+    in_any = (before == level) | (now == level)
+    count, labels = cv2.connectedComponents(in_both.view(np.uint8), connectivity=8)
+    # Pixels beside a shape have its label; a float32 holds more labels than a picture has pixels for.
+    dilated = cv2.dilate(labels.astype(np.float32), _CROSS)
+    near, farther = dilated.astype(np.int32), cv2.dilate(dilated, _CROSS).astype(np.int32)
+    widened = cv2.dilate(in_any.view(np.uint8), _CROSS) > 0
+    first, second = (near > 0) & ~in_any, (farther > 0) & ~widened
+    border = in_both & (cv2.erode(in_any.view(np.uint8), _CROSS) == 0)
+    _, regions = cv2.connectedComponents(cv2.dilate(in_both.view(np.uint8), _NEARBY))
+    groups = np.zeros(count, np.int32)
+    groups[labels[in_both]] = regions[in_both]
+
+    def sum_up(which: NDArray[np.int32], values: Array | None = None) -> Array:
+        sums: Array = np.bincount(which, values, count).astype(np.float64)
+        return sums
+
+    def step_at(place: Mask) -> Array:
+        seen = before[place].astype(np.float64), now[place].astype(np.float64)
+        return np.abs(0.5 * (seen[0] + seen[1]) - level)
+
+    def change_at(place: Mask) -> Array:
+        return np.abs(before[place].astype(np.float64) - now[place].astype(np.float64))
+
+    of_shapes = [
+        *(sum_up(near[first], values) for values in (None, step_at(first), change_at(first))),
+        *(sum_up(farther[second], values) for values in (None, step_at(second), change_at(second))),
+        sum_up(labels[border]),
+        sum_up(near[in_any & ~in_both]),
+    ]
+    steady = np.zeros(count, bool)
+    for group in (np.minimum(groups, 1), groups, np.arange(count)):
+        sums = [np.bincount(group[1:], one[1:], count)[group] for one in of_shapes]
+        size, farther_size = np.maximum(sums[0], 1.0), np.maximum(sums[3], 1.0)
+        is_high = sums[4] > OVERLAY_STEP_SIGMAS * noise * farther_size
+        step = np.where(is_high, sums[4] / farther_size, 255.0)
+        # What noise alone leaves of the step is no more of an edge.
+        left = 1.0 - sums[1] / size / step
+        left = np.clip(left, noise / np.sqrt(size) / step, 1.0 - 1e-6)
+        # The first pixels are half a pixel from the border on average.
+        slope = -step * np.log(left) / 0.5
+        # The mean difference of two normal deviates is 2 / sqrt(pi) of their sigma.
+        expected = 2.0 / np.sqrt(np.pi) * noise * sums[6] / slope
+        is_steady = sums[7] <= OVERLAY_STEADY_MAX * expected
+        # The mean size of a normal deviate is known to 0.76 of itself over the root of their number.
+        chance = 0.76 * np.sqrt(1.0 / size + 1.0 / farther_size)
+        quietest = np.minimum(OVERLAY_QUIET_MAX, 1.0 - OVERLAY_QUIET_SIGMAS * chance)
+        is_quiet = sums[2] / size < quietest * sums[5] / farther_size
+        steady |= is_high & is_steady & (is_quiet | (left <= OVERLAY_SHARP_MAX))
+    steady[0] = False
+    return np.asarray(steady[labels])
 
 
 def remove_overlay(image: AnyImage, overlay: Mask) -> AnyImage:

@@ -439,6 +439,29 @@ OVERLAY_CLIPPED_MIN = TABLE.measured(
     "cases.",
     command=TRIED,
 )
+OVERLAY_STEADY_MAX = TABLE.stated(
+    "OVERLAY_STEADY_MAX", 0.25, "of what noise changes",
+    "Pixels of the border of a shape in an extreme grey level that change from picture to picture. Of particles of up "
+    "to eight times the range as many change as are expected.",
+)
+OVERLAY_QUIET_MAX = TABLE.stated(
+    "OVERLAY_QUIET_MAX", 0.75, "of the noise",
+    "That is left beside a shape whose edge is mixed with the picture, half of it on average. Beside a clipped part of "
+    "a specimen there is more of it; but what noise clips does not count, so that up to a tenth seems to be missing.",
+)
+OVERLAY_QUIET_SIGMAS = TABLE.derived(
+    "OVERLAY_QUIET_SIGMAS", 5.0, "sigma",
+    "By which it is less: by chance, once in 3 x 10^6.",
+)
+OVERLAY_SHARP_MAX = TABLE.derived(
+    "OVERLAY_SHARP_MAX", 0.02, "of the step",
+    "That is left one pixel beside a shape. A Gaussian edge of 0.7 px leaves as much where it is clipped at a "
+    "twentieth of its height, and one of 0.5 px at a third.",
+)
+OVERLAY_STEP_SIGMAS = TABLE.stated(
+    "OVERLAY_STEP_SIGMAS", 5.0, "sigma of the noise",
+    "That a shape differs from what lies around it: noise that is clipped makes shapes, too.",
+)
 OVERLAY_NOISE_MIN = TABLE.derived(
     "OVERLAY_NOISE_MIN", 1.5, "grey levels",
     "Below which pixels are the same by chance: at 1.5, the difference of two is rounded to zero in one of five, "
