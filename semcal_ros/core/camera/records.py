@@ -34,9 +34,9 @@ NOT_RECORDED = "not recorded"
 
 # The microscope is named by these alone, without a label.
 _MICROSCOPE = ("maker", "model", "serial_number")
-# Of interest with the views, not with the microscope.
 # What changes the scale of any microscope.
 _ESSENTIAL = ("acceleration_voltage_v", "working_distance_m")
+# Of interest with the views, not with the microscope.
 _OF_VIEWS = ("beam", "stage_tilt_rad", "stage_rotation_rad", "frame_interval_s")
 
 

@@ -67,7 +67,7 @@ class PreparedReference:
     reference: Reference
 
     def serves(self, key: int, keyframe: Keyframe) -> bool:
-        """Whether it still is good enough for a keyframe: that has not become much better, or another one."""
+        """Whether it still is good enough for a keyframe, which has neither been replaced nor improved much since."""
         mine = self.keyframe
         return (
             self.is_of(key, keyframe)

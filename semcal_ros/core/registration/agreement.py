@@ -100,7 +100,8 @@ class Agreement:
     Attributes
     ----------
     weights
-        (rows, cols) of the tiles that were compared: their information over the noise, and 0 where they disagree.
+        (rows, cols) 0 to 1 of the tiles that were compared: how much of their gradients is structure and not noise, and
+        0 where they disagree.
     disagrees
         (rows, cols) the tiles that show something else.
     share
@@ -119,7 +120,7 @@ class Agreement:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all of the image agrees: no body does not, not even where the ground has no structure."""
+        """Whether all of the image agrees: no body disagrees, even where the ground has no structure."""
         most = self.share > COMPLETE_SHARE_MIN and self.pull < 1.0 - COMPLETE_SHARE_MIN
         return most and not np.any(keep_bodies(self.disagrees, BODY_TILES_MIN))
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""SEM TIFFs of four makers: small files with the makers' tags, and hostile variants."""
+"""SEM TIFFs of the makers: small files with the makers' tags, and hostile variants."""
 
 from __future__ import annotations
 

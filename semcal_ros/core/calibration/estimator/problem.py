@@ -242,6 +242,7 @@ class Setup:
         """Return the 1-sigma of the change of a camera parameter over the calibrated range."""
         p = self.priors
         centre = p.centre_change_fraction * self.image_size[0]
+        constants = ("px", "py", "rho")
         return {
             "scale": p.scale_change,
             "aspect": p.aspect_change,
@@ -253,7 +254,8 @@ class Setup:
             "ex": centre,
             "ey": centre,
             **dict.fromkeys(SCAN_NAMES, p.scan_change),
-        }.get(name, self.prior_of(name)[1])
+            **{constant: self.prior_of(constant)[1] for constant in constants},
+        }[name]
 
     def breaks_of(self, name: str) -> Array:
         """Return the breakpoints of a camera parameter: only scale, aspect and skew have any."""
