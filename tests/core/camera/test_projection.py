@@ -33,6 +33,7 @@ ALONG = [0.004, -0.006, 0.001, 0.002, 0.001, 0.002, 0.01, -0.003, 0.002]
 ACROSS = [0.003, 0.005, -0.001, 0.002]
 TERMS = np.array([*LENS, *ALONG, *ACROSS])
 PARAMETERS = np.concatenate([BASIC, TERMS])
+assert len(PARAMETERS) == len(ALL_NAMES), f"each of {ALL_NAMES} needs a value here"
 POINTS = np.random.default_rng(3).uniform(-5e-4, 5e-4, (60, 3))
 
 
