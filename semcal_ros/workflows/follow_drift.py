@@ -38,6 +38,7 @@ from semcal_ros.core.drift.thresholds import (
 )
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.reference import RegistrationSettings
+from semcal_ros.core.wording import counted
 from semcal_ros.files.recordings import RecordedFrame
 
 #: What a user can do about a timing that is not configured.
@@ -177,6 +178,16 @@ def describe_beginnings(path: DriftPath) -> list[str]:
             f"time runs backwards at {'frame' if back.size == 1 else 'frames'} {which}{more}: "
             "from there on, drift is counted from that frame"
         )
+    lost = np.setdiff1d(np.flatnonzero(path.restarted), [*back, *range(first + 1)]).tolist()
+    for k in lost[:_NAMED]:
+        sigma_px = float(np.max(path[k].sigma_px))
+        known = f"known to {sigma_px:.2g} px (1-sigma)" if np.isfinite(sigma_px) else "not known"
+        notes.append(
+            f"tracking began again at frame {k + 1} ({path[k].reason}): how far the specimen had moved since the "
+            f"frames before is {known}"
+        )
+    if len(lost) > _NAMED:
+        notes.append(f"tracking began again {counted(len(lost) - _NAMED, 'more time')}")
     return notes
 
 

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -105,3 +106,20 @@ def path_of(times: Sequence[float], refused: Sequence[int] = ()) -> DriftPath:
 )
 def test_from_which_frame_drift_is_counted_is_said(path: DriftPath, said: list[str]) -> None:
     assert describe_beginnings(path) == said
+
+
+def test_where_tracking_began_again_is_said_with_what_is_known_of_it() -> None:
+    updates = list(path_of([float(k) for k in range(12)]).updates)
+    elsewhere = Rejection(MatchFailure.DISSIMILAR, "too little of the specimen in common")
+    for k in (3, 5, 7, 9):
+        updates[k] = replace(
+            updates[k], rejection=elsewhere, restarted=True, covariance=np.eye(6) * 96.0**2
+        )
+    place = "how far the specimen had moved since the frames before is known to 96 px (1-sigma)"
+    assert describe_beginnings(DriftPath(tuple(updates))) == [
+        *(
+            f"tracking began again at frame {k} (too little of the specimen in common): {place}"
+            for k in (4, 6, 8)
+        ),
+        "tracking began again 1 more time",
+    ]
