@@ -410,8 +410,20 @@ class DriftPath:
 
     @property
     def trusted(self) -> Mask:
-        """(n,) bool: accepted, and tracked all the way back to the first frame."""
-        return self.accepted & ~np.logical_or.accumulate(self.restarted)
+        """(n,) bool: accepted, and tracked all the way back to the first frame.
+
+        After a restart nothing is, until a frame is found with one from before it: nothing else makes its place known
+        to half of the 1-sigma that it had there. Where the drift begins anew at zero, nothing is from then on.
+        """
+        limit, tied = np.inf, np.ones(len(self.updates), dtype=bool)
+        for k, update in enumerate(self.updates):
+            if update.restarted:
+                sigma_px = update.sigma_px.max()
+                limit = min(limit, 0.5 * sigma_px if np.isfinite(sigma_px) else 0.0)
+                tied[k] = False
+            elif limit < np.inf:
+                tied[k] = update.sigma_px.max() < limit
+        return self.accepted & tied
 
     @property
     def followed(self) -> bool:

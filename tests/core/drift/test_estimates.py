@@ -104,6 +104,19 @@ def test_what_follows_a_restart_is_not_trusted() -> None:
     assert DriftPath(updates).trusted.tolist() == [True, False, True, False, False]
 
 
+def test_a_frame_that_is_found_with_one_from_before_a_restart_is_trusted() -> None:
+    sigmas_px = (0.0, 0.02, 96.0, 96.0, 95.9, 0.02, 0.02)
+    updates = [
+        make_drift_update(covariance=sigma**2 * np.eye(6), restarted=k == 2)
+        for k, sigma in enumerate(sigmas_px)
+    ]
+    trusted = [True, True, False, False, False, True, True]
+    assert DriftPath(updates).trusted.tolist() == trusted
+    # Where the time goes back, the drift begins anew at zero.
+    updates[6] = replace(updates[6], restarted=True, covariance=np.zeros((6, 6)))
+    assert DriftPath([*updates, updates[5]]).trusted.tolist() == [*trusted[:6], False, False]
+
+
 def test_an_outlook_stays_as_it_was_while_tracking_goes_on() -> None:
     tracker = DriftTracker()
     feed(tracker, 0, 10)
