@@ -146,16 +146,17 @@ def slanted(tilt_deg: float, gs: tuple[float, ...], spread_deg: float = 0.0) -> 
 
 
 @pytest.mark.parametrize(
-    ("tilt_deg", "gs"),
+    "case",
     long_but(
         lambda case: case == (17.0, (500.0, 900.0)),
         [(17.0, (500.0, 900.0)), (30.0, (500.0, 900.0)), (17.0, (20000.0, 36000.0))],
     ),
 )
 def test_one_tilt_of_all_views_is_not_told_from_the_aspect_ratio(
-    tilt_deg: float, gs: tuple[float, ...]
+    case: tuple[float, tuple[float, ...]],
 ) -> None:
     """A specimen that is turned on a slanted stub is shortened alike in all views, as by a scan that is not square."""
+    tilt_deg, gs = case
     seen = slanted(tilt_deg, gs)
     result = calibrated(seen)
     error, sigma = relative_errors(result, gs[0])
