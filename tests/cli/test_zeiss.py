@@ -35,6 +35,7 @@ SIZE = 256
 START = datetime(2026, 5, 4, 9, 30)
 
 
+@pytest.mark.long
 def test_zeiss_files_of_a_grid_to_a_corrected_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

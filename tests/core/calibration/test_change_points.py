@@ -204,7 +204,7 @@ def _draw_scales(rng, scatter, step=0.0, visits=1, order=5):
 
 
 @pytest.mark.parametrize("scatter", [0.02, 0.1, 0.3])
-@pytest.mark.parametrize("visits", [1, 2])
+@pytest.mark.parametrize("visits", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_scales_that_do_not_jump_are_rarely_said_to(scatter, visits):
     """However much visits scatter: the chance is 0.01, and 1000 recordings show 10 +- 3."""
     rng = np.random.default_rng(7)

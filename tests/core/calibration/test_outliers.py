@@ -129,7 +129,7 @@ def test_of_three_views_the_one_of_other_squares_is_left_out():
     assert np.all(np.abs(error) < 3.0 * np.array(camera.pixel_size_sigma_m))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_two_views_that_do_not_agree_none_is_believed():
     views = _of_stage(2)
     names = f"{views[0].name} .*{views[1].name} .*"

@@ -98,7 +98,9 @@ def test_earlier_frames_were_pulled_by_as_much_less_as_they_moved_less() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [101, 102, 107])
+@pytest.mark.parametrize(
+    "seed", [101, *(pytest.param(seed, marks=pytest.mark.long) for seed in (102, 107))]
+)
 def test_a_gripper_that_was_there_from_the_start_is_in_the_sigma(seed: int) -> None:
     frames, drift, _ = draw(KINDS["gripper over sparse"], seed)
     tracker = DriftTracker()

@@ -151,7 +151,7 @@ def test_to_begin_late_or_to_be_reset_is_no_restart() -> None:
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 0.2, 0.35, 0.6])
-@pytest.mark.parametrize("interval_s", [0.5, 0.7])
+@pytest.mark.parametrize("interval_s", [0.5, pytest.param(0.7, marks=pytest.mark.long)])
 def test_hindsight_that_contradicts_the_frames_is_not_believed(
     begin_s: float, interval_s: float
 ) -> None:

@@ -623,7 +623,9 @@ def test_a_stage_that_jumps_under_a_tool_is_not_denied_by_the_sigma(
     assert coasted >= 1 and update.accepted
 
 
-@pytest.mark.parametrize("scene", ["gold", "ridges", "tool over gold"])
+@pytest.mark.parametrize(
+    "scene", [pytest.param("gold", marks=pytest.mark.long), "ridges", "tool over gold"]
+)
 @pytest.mark.parametrize(("jump_px", "line"), [(5.0, 0.35), (20.0, 0.45), (60.0, 0.35)])
 def test_a_stage_that_moves_within_a_frame_is_said_and_believed_when_it_stays(
     scene: str, jump_px: float, line: float

@@ -74,7 +74,7 @@ IGNORED = ["ROS up: False", "Handlers", "Handlers"]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("number", [2, 15])
+@pytest.mark.parametrize("number", [2, pytest.param(15, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("moment", "printed"),
     [
