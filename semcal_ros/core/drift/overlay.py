@@ -92,6 +92,15 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     return grow_mask(core, OVERLAY_ENLARGED_PX)
 
 
+def _box_around(mask: Mask, margin_px: int) -> tuple[slice, slice]:
+    """The rows and columns of a mask (h, w) with anything in it, and ``margin_px`` more to each side."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(rows[0] - margin_px, 0), rows[-1] + 1 + margin_px),
+        slice(max(columns[0] - margin_px, 0), columns[-1] + 1 + margin_px),
+    )
+
+
 def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: float) -> Mask:
     """(h, w) True in shapes of one extreme grey level that no specimen has that is clipped to it.
 
@@ -101,18 +110,21 @@ def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: floa
     nothing is left of the step beside them; or what is left was mixed with the picture, and has less noise than that.
     This is asked of all shapes together, of those that are near each other, and of each.
     """
-    in_both = (before == level) & (now == level)
-    if not np.any(in_both):
-        return in_both
+    whole = (before == level) & (now == level)
+    if not np.any(whole):
+        return whole
+    # Most pictures have next to no such pixels.
+    cut = _box_around(whole, 2 * OVERLAY_TEXT_PX)
+    before, now, in_both = before[cut], now[cut], whole[cut]
     in_any = (before == level) | (now == level)
-    count, labels = cv2.connectedComponents(in_both.view(np.uint8), connectivity=8)
+    count, labels = cv2.connectedComponents(in_both.astype(np.uint8), connectivity=8)
     # Pixels beside a shape have its label; a float32 holds more labels than a picture has pixels for.
     dilated = cv2.dilate(labels.astype(np.float32), _CROSS)
     near, farther = dilated.astype(np.int32), cv2.dilate(dilated, _CROSS).astype(np.int32)
-    widened = cv2.dilate(in_any.view(np.uint8), _CROSS) > 0
+    widened = cv2.dilate(in_any.astype(np.uint8), _CROSS) > 0
     first, second = (near > 0) & ~in_any, (farther > 0) & ~widened
-    border = in_both & (cv2.erode(in_any.view(np.uint8), _CROSS) == 0)
-    _, regions = cv2.connectedComponents(cv2.dilate(in_both.view(np.uint8), _NEARBY))
+    border = in_both & (cv2.erode(in_any.astype(np.uint8), _CROSS) == 0)
+    _, regions = cv2.connectedComponents(cv2.dilate(in_both.astype(np.uint8), _NEARBY))
     groups = np.zeros(count, np.int32)
     groups[labels[in_both]] = regions[in_both]
 
@@ -153,19 +165,18 @@ def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: floa
         is_quiet = sums[2] / size < quietest * sums[5] / farther_size
         steady |= is_high & is_steady & (is_quiet | (left <= OVERLAY_SHARP_MAX))
     steady[0] = False
-    return np.asarray(steady[labels])
+    found = np.zeros_like(whole)
+    found[cut] = steady[labels]
+    return found
 
 
 def remove_overlay(image: AnyImage, overlay: Mask) -> AnyImage:
     """The picture (h, w) or (h, w, 3) with the mean of what lies around in the place of an overlay (h, w)."""
     out = np.array(image)
-    spans = [np.flatnonzero(overlay.any(axis=axis)) for axis in (1, 0)]
-    if not len(spans[0]):
+    if not np.any(overlay):
         return out
     # Nothing else is read: of a data bar, some rows above it.
-    cut = tuple(
-        slice(max(n[0] - OVERLAY_FILLED_PX, 0), n[-1] + 1 + OVERLAY_FILLED_PX) for n in spans
-    )
+    cut = _box_around(overlay, OVERLAY_FILLED_PX)
     drawn = overlay[cut]
     places, seen = np.flatnonzero(drawn), (~drawn).view(np.uint8)
     # Sums of integers are the faster ones.

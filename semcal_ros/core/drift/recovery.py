@@ -108,12 +108,11 @@ def leave_place(
     seen with both. But it does not show the place of the other one: the specimen has moved since the last frame, out of
     sight.
     """
+    if all(one.rejection.status in IMAGE_FAILURES for one in rejected):
+        return state
     _, covariance = state.filter.state.predict_shift(key)
-    sigma_px = frame.px_from_unit @ covariance @ frame.px_from_unit.T
-    is_known = (
-        np.linalg.eigvalsh(sigma_px)[-1] <= reach_of_drift_px(setup.settings.first_step_px) ** 2
-    )
-    if is_known or all(one.rejection.status in IMAGE_FAILURES for one in rejected):
+    variance_px2 = np.linalg.eigvalsh(frame.px_from_unit @ covariance @ frame.px_from_unit.T)[-1]
+    if variance_px2 <= reach_of_drift_px(setup.settings.first_step_px) ** 2:
         return state
     since_s = max(state.filter.state.time_s - state.previous_s, INTERVAL_S_MIN)
     speed_px_s = setup.settings.first_step_px / since_s
