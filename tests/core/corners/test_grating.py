@@ -23,6 +23,7 @@ import pytest
 from semcal_ros.core.corners import LatticeDetection, LatticeStatus, find_lattice
 from semcal_ros.core.errors import Rejection
 from tests.helpers.grids import Board, PatternBoard
+from tests.helpers.long_tests import long_but
 
 
 def found_in(board: PatternBoard, seed: int = 1) -> LatticeDetection:
@@ -88,9 +89,7 @@ def photographed(rng: np.random.Generator, mean: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
 
 
-@pytest.mark.parametrize(
-    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 6))]
-)
+@pytest.mark.parametrize("seed", long_but(lambda seed: seed < 2, range(6)))
 def test_a_hole_or_a_deposit_with_more_contrast_than_the_lines_hides_no_others(seed: int) -> None:
     rng = np.random.default_rng(seed)
     side, period = 400, float(rng.uniform(12.0, 50.0))

@@ -26,6 +26,7 @@ from semcal_ros.core.drift.filter_update import limit_by_pull, widen_earlier
 from semcal_ros.core.drift.operations import Measure, Predict
 from semcal_ros.core.drift.state import BASE_SIZE, DriftState
 from semcal_ros.core.drift.tracker import DriftTracker
+from tests.helpers.long_tests import long_but
 
 NOISE = 0.05
 
@@ -98,9 +99,7 @@ def test_earlier_frames_were_pulled_by_as_much_less_as_they_moved_less() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed", [101, *(pytest.param(seed, marks=pytest.mark.long) for seed in (102, 107))]
-)
+@pytest.mark.parametrize("seed", long_but(lambda seed: seed == 101, [101, 102, 107]))
 def test_a_gripper_that_was_there_from_the_start_is_in_the_sigma(seed: int) -> None:
     frames, drift, _ = draw(KINDS["gripper over sparse"], seed)
     tracker = DriftTracker()
