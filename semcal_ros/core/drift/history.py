@@ -156,6 +156,8 @@ def _contradicts(update: DriftUpdate, smoothed: DriftUpdate) -> bool:
     apart, covariance = smoothed.drift_m - update.drift_m, update.covariance[:2, :2]
     if not (update.accepted and np.all(np.isfinite(covariance)) and np.any(covariance)):
         return False
+    if np.trace(smoothed.covariance[:2, :2]) > np.trace(covariance):
+        return False
     return float(apart @ solve_scaled(covariance, apart)) > INNOVATION_CHI2_MAX
 
 

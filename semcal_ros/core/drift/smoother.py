@@ -46,6 +46,9 @@ from semcal_ros.core.drift.thresholds import (
     MEASUREMENT_COST_MAX,
     MEASUREMENTS_UNCOUNTED,
     SMOOTHER_BLOCK,
+    WALK_EVIDENCE_MIN,
+    WALK_FRAMES,
+    WALK_LOG_RANGE,
 )
 from semcal_ros.core.errors import InvalidValueError
 
@@ -179,6 +182,9 @@ def estimate_process_noise(
 ) -> ProcessNoise:
     """The process noise that makes the measurements most likely, or one that is larger by some deviations.
 
+    A smooth drift is preferred to a random walk unless the measurements are strong evidence for the latter. Where
+    ``deviations`` are told and there is no strong evidence for either, the process noise has both.
+
     Parameters
     ----------
     start, events
@@ -187,7 +193,8 @@ def estimate_process_noise(
         A guess whose density is greater than 0 and right within some orders of magnitude, and
         whose time constant is that of a few frames.
     time_constants
-        Multiples of that time constant to choose from; 0 is a white acceleration.
+        Multiples of that time constant to choose from, of a smooth drift; 0 is a white acceleration. A random walk has
+        the time constant itself, and is not tried where that is 0.
     deviations
         The density is the largest whose likelihood lies within so many standard deviations of the highest, but no
         more than the guess unless the likeliest is: what shows to be more is known well enough. A few
@@ -204,53 +211,114 @@ def estimate_process_noise(
     part = list(events)[: 4 * LIKELIHOOD_MEASUREMENTS_MAX]
     if sum(isinstance(event, Measure) for event in part) < LIKELIHOOD_MEASUREMENTS_MIN:
         return near
-    candidates = [
-        _maximise_likelihood(start, part, near, factor * near.time_constant_s, deviations)
-        for factor in time_constants
-    ]
-    return min(candidates, key=lambda pair: pair[0])[1]
+    few_frames_s = near.time_constant_s
+    smooth_near, walk_near = near, None
+    if few_frames_s > 0.0:
+        # The guess as either of them, with which it predicts a step of the same length.
+        smooth_near = _as_restless(replace(near, walk_s2=0.0), near, few_frames_s)
+        walk_near = _as_restless(
+            replace(near, walk_s2=WALK_FRAMES * few_frames_s**2), near, few_frames_s
+        )
+    likely = min(
+        (
+            _maximise_likelihood(
+                start, part, replace(smooth_near, time_constant_s=factor * few_frames_s)
+            )
+            for factor in time_constants
+        ),
+        key=lambda smooth: smooth.lowest,
+    )
+    if walk_near is not None:
+        middle = _as_restless(walk_near, likely.process_noise, few_frames_s).psd / walk_near.psd
+        bounds = np.log(middle) + np.array(WALK_LOG_RANGE)
+        walk = _refine(_Likelihood(start, part, walk_near), (float(bounds[0]), float(bounds[1])))
+        evidence = likely.lowest - walk.lowest
+        if evidence > WALK_EVIDENCE_MIN:
+            likely = walk
+        elif deviations > 0.0 and evidence > -WALK_EVIDENCE_MIN:
+            return _add(likely.larger_by(deviations), walk.larger_by(deviations))
+    return likely.larger_by(deviations)
 
 
-def _maximise_likelihood(
-    start: DriftState,
-    events: Sequence[Event],
-    near: ProcessNoise,
-    time_constant_s: float,
-    deviations: float,
-) -> tuple[float, ProcessNoise]:
-    """Minus twice the log likelihood of the best density, and the process noise with it, or with one that is larger by
-    so many standard deviations.
-    """
+def _as_restless(model: ProcessNoise, other: ProcessNoise, step_s: float) -> ProcessNoise:
+    """A process noise with the density at which it predicts as long a step as another one."""
+    steps = [noise.discretise(step_s)[1][0, 0] for noise in (other, model)]
+    return replace(model, psd=model.psd * float(steps[0] / steps[1]))
 
-    def with_density(log_psd: float) -> ProcessNoise:
-        psd = near.psd * float(np.exp(log_psd))
-        return replace(near, psd=psd, time_constant_s=time_constant_s)
 
-    def cost(log_psd: float) -> float:
+def _add(smooth: ProcessNoise, walk: ProcessNoise) -> ProcessNoise:
+    """The acceleration of one and the steps of the other."""
+    return replace(smooth, walk_s2=walk.psd * walk.walk_s2 / smooth.psd)
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """How likely measurements are with the process noise ``near``, but for its density."""
+
+    start: DriftState
+    events: Sequence[Event]
+    near: ProcessNoise
+
+    def with_density(self, log_psd: float) -> ProcessNoise:
+        """The process noise whose density is greater by that logarithm."""
+        return replace(self.near, psd=self.near.psd * float(np.exp(log_psd)))
+
+    def cost(self, log_psd: float) -> float:
+        """Minus twice the logarithm of the likelihood."""
         costs = [
             min(outcome.nis + outcome.shear_nis, MEASUREMENT_COST_MAX)
             + float(np.linalg.slogdet(outcome.innovation_covariance)[1])
-            for _, outcome in _apply(start, events, with_density(log_psd))
+            for _, outcome in _apply(self.start, self.events, self.with_density(log_psd))
             if outcome is not None
         ]
         return sum(costs[MEASUREMENTS_UNCOUNTED:], start=0.0)
 
+
+@dataclass(frozen=True)
+class _Likeliest:
+    """The density at which the cost is lowest."""
+
+    likelihood: _Likelihood
+    log_psd: float
+    lowest: float
+
+    @property
+    def process_noise(self) -> ProcessNoise:
+        """The process noise with that density."""
+        return self.likelihood.with_density(self.log_psd)
+
+    def larger_by(self, deviations: float) -> ProcessNoise:
+        """The process noise with that density, or with one that is larger by so many standard deviations."""
+        likely = self.log_psd
+        if deviations > 0.0:
+            # Minus twice the log likelihood rises by one at one deviation.
+            still = self.lowest + deviations**2
+            cost, larger = self.likelihood.cost, DENSITY_LOG_RANGE[1]
+            if cost(larger) > still:
+                larger = float(
+                    brentq(lambda v: cost(v) - still, likely, larger, xtol=DENSITY_LOG_TOLERANCE)
+                )
+            # What the measurements show to be more than the guess is known well enough.
+            likely = max(likely, min(larger, 0.0))
+        return self.likelihood.with_density(likely)
+
+
+def _maximise_likelihood(
+    start: DriftState, events: Sequence[Event], near: ProcessNoise
+) -> _Likeliest:
+    """The best density of a process noise, within some orders of magnitude of the one of ``near``."""
+    likelihood = _Likelihood(start, events, near)
     grid = np.linspace(*DENSITY_LOG_RANGE, DENSITY_GRID)
-    best = int(np.argmin([cost(float(v)) for v in grid]))
+    best = int(np.argmin([likelihood.cost(float(v)) for v in grid]))
     bounds = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, DENSITY_GRID - 1)])
+    return _refine(likelihood, bounds)
+
+
+def _refine(likelihood: _Likelihood, bounds: tuple[float, float]) -> _Likeliest:
     found = minimize_scalar(
-        cost, bounds=bounds, method="bounded", options={"xatol": DENSITY_LOG_TOLERANCE}
+        likelihood.cost,
+        bounds=bounds,
+        method="bounded",
+        options={"xatol": DENSITY_LOG_TOLERANCE},
     )
-    likely = float(found.x)
-    if deviations > 0.0:
-        # Minus twice the log likelihood rises by one at one deviation.
-        still = float(found.fun) + deviations**2
-        highest = DENSITY_LOG_RANGE[1]
-        larger = highest
-        if cost(highest) > still:
-            larger = float(
-                brentq(lambda v: cost(v) - still, likely, highest, xtol=DENSITY_LOG_TOLERANCE)
-            )
-        # What the measurements show to be more than the guess is known well enough.
-        likely = max(likely, min(larger, 0.0))
-    return float(found.fun), with_density(likely)
+    return _Likeliest(likelihood, float(found.x), float(found.fun))

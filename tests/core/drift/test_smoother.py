@@ -555,6 +555,45 @@ def test_a_long_memory_is_told_from_a_white_acceleration() -> None:
         )
 
 
+def test_a_random_walk_is_told_from_a_smooth_drift() -> None:
+    near = ProcessNoise(1.0, 1.0)
+    for true in (ProcessNoise(1.0 / 30.0, 1.0, walk_s2=30.0), ProcessNoise(0.04, 1.0)):
+        walks = []
+        for seed in range(6):
+            rng = np.random.default_rng(seed)
+            events, _ = simulated(rng, np.arange(17.0), true, 0.02)
+            found = estimate_process_noise(initial_state(0.0), events, near, (1.0,))
+            walks.append(found.walk_s2 > 0.0)
+            if all(walks) and true.walk_s2 > 0.0:
+                # The logarithm of a variance of 32 independent steps is known to sqrt(2 / 32) = 0.25.
+                assert abs(np.log(found.psd / true.psd)) < 4.0 * 0.25
+        assert np.mean(walks) == float(true.walk_s2 > 0.0)
+
+
+def test_what_may_be_smooth_or_a_walk_is_allowed_to_be_both() -> None:
+    near = ProcessNoise(1.0, 1.0)
+    events, _ = simulated(np.random.default_rng(0), np.arange(6.0), ProcessNoise(0.04, 1.0), 0.3)
+    smooth_drift = estimate_process_noise(initial_state(0.0), events, near, (1.0,))
+    both = estimate_process_noise(initial_state(0.0), events, near, (1.0,), deviations=1.0)
+    assert smooth_drift.walk_s2 == 0.0
+    assert both.walk_s2 > 0.0
+    assert both.psd > smooth_drift.psd
+
+
+def test_after_a_gap_in_a_random_walk_the_error_is_as_large_as_its_sigma() -> None:
+    true = ProcessNoise(1.0 / 30.0, 1.0, walk_s2=30.0)
+    scaled = []
+    for seed in range(40):
+        events, truth = simulated(np.random.default_rng(seed), np.arange(25.0), true, 0.02)
+        seen = [e for k, e in enumerate(events) if not (isinstance(e, Measure) and 46 < k < 64)]
+        found = estimate_process_noise(initial_state(0.0), seen, ProcessNoise(1.0, 1.0), (1.0,))
+        state = smooth(initial_state(0.0), seen, found)[17]
+        sigma = np.sqrt(np.diag(state.drift_covariance)[:2])
+        scaled.append((state.position - truth[17, :2]) / sigma)
+    # 80 errors: four deviations of an RMS of 1, 4 / sqrt(160).
+    assert abs(float(np.sqrt(np.mean(np.square(scaled)))) - 1.0) < 0.32
+
+
 def test_few_measurements_leave_the_process_noise_as_it_was() -> None:
     events, _ = simulated(np.random.default_rng(0), np.arange(4.0), ProcessNoise(0.04), 0.05)
     near = ProcessNoise(0.7, 3.0)

@@ -258,7 +258,8 @@ def test_the_sigma_in_px_is_that_of_the_registration_and_not_of_the_scale() -> N
     sigmas = []
     for camera in (CAMERA, uncertain):
         run = Run((0.3e-6, -0.2e-6))
-        for k in range(5):
+        # As many as tell that the drift is smooth.
+        for k in range(9):
             update = run.step(k, camera)
         sigmas.append(update.sigma_px)
         of_metres = np.sqrt(
