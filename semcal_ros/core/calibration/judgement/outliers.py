@@ -53,6 +53,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     STEP_LEFT_MIN,
     SWAMPED_PART,
     TILT_SIGMAS,
+    TRIMMED_PART,
     USUAL_VIEWS,
     VIEWS_MIN,
     WRONG_PART_MAX,
@@ -259,7 +260,7 @@ class Deviations:
     ----------
     height_m, stretch, misfit
         (V,) height about that of the other views at its magnification, m; the larger of stretch and shear of
-        its lattice; RMS residual over that of the median view.
+        its lattice; RMS residual over that of the median view, each without the largest quarter of the corners.
     others_height_m
         (V,) RMS of such heights among the views with which it is compared, m.
     visit_scale
@@ -278,12 +279,19 @@ class Deviations:
 
     def reject(self, view: int) -> Rejection[ViewStatus]:
         """Return why a view is left out."""
+        residuals = f"residuals that are {self.misfit[view]:.1f} times the usual"
+        if self.misfit[view] > MISFIT_RATIO and self.of_limit[view] <= 1.0:
+            return Rejection(
+                ViewStatus.OUTLIER,
+                f"does not agree with the other views: {residuals}; wrong magnification or square size, or corners "
+                "that are not the grid's",
+            )
         return Rejection(
             ViewStatus.OUTLIER,
-            f"does not agree with the other views: {1e6 * self.height_m[view]:.0f} um of height, where the others "
+            f"does not agree with the other views: {1e6 * abs(self.height_m[view]):.0f} um of height, where the others "
             f"scatter by {1e6 * self.others_height_m[view]:.0f} um, a grid stretched by "
-            f"{100.0 * self.stretch[view]:.2g} %, a scale that is off by {100.0 * abs(self.visit_scale[view]):.2g} % "
-            f"more, and residuals {self.misfit[view]:.1f} times the usual; wrong magnification, or a wrong square size",
+            f"{100.0 * self.stretch[view]:.2g} %, a scale that differs by {100.0 * abs(self.visit_scale[view]):.2g} % "
+            f"more, and {residuals}; wrong magnification, or a wrong square size",
         )
 
 
@@ -297,9 +305,10 @@ def measure_deviations(
     1-sigma.
     """
     count = len(problem.group)
-    square = np.add.reduceat(
-        whitened_norm(problem, result.residuals_px) ** 2, problem.starts[:-1]
-    ) / np.diff(problem.starts)
+    squares = whitened_norm(problem, result.residuals_px) ** 2
+    square = np.array(
+        [_trimmed_mean(own) for own in np.split(squares, np.asarray(problem.starts[1:-1]))]
+    )
     misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
     tilted = result.state.rotations[:, 2, 2] <= np.cos(FLAT_RAD)
     lattices = np.abs(result.state.lattices)
@@ -319,6 +328,14 @@ def measure_deviations(
     visit_scale, visit_of_limit = _measure_lone_visits(problem, result)
     of_limit = np.hypot(of_limit, visit_of_limit)
     return Deviations(height, stretch, misfit, others, visit_scale, of_limit)
+
+
+def _trimmed_mean(squares: Array) -> float:
+    """Mean without the largest part, since one wrong corner is no wrong view (least trimmed squares, Rousseeuw and Van
+    Driessen 2006, doi:10.1007/s10618-005-0024-4).
+    """
+    kept = max(int(np.ceil(TRIMMED_PART * len(squares))), 1)
+    return float(np.mean(np.partition(squares, kept - 1)[:kept]))
 
 
 def _measure_lone_visits(problem: Problem, result: BundleResult) -> tuple[Array, Array]:

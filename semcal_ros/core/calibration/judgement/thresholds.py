@@ -189,6 +189,11 @@ MISFIT_RATIO = TABLE.measured(
     "times or a thousandth of it does.",
     command=TRIED,
 )
+TRIMMED_PART = TABLE.derived(
+    "TRIMMED_PART", 0.75, "of the corners",
+    "That count in a view's residuals, those with the smallest ones: a quarter may be wrong, which is the usual choice "
+    "(Rousseeuw and Van Driessen 2006, doi:10.1007/s10618-005-0024-4).",
+)
 VIEWS_MIN = TABLE.stated(
     "VIEWS_MIN", 3, "views",
     "Where a magnification has fewer, they are compared with those at all.",
