@@ -278,6 +278,20 @@ def test_a_view_that_fits_much_worse_than_the_others_is_an_outlier(times, odd):
     assert list(find_outliers(*_adjusted(GROUP, residual))) == ([17] if odd else [])
 
 
+@pytest.mark.parametrize(("corners", "odd"), [(2, False), (5, True)])
+def test_some_corners_that_are_far_off_are_no_wrong_view(corners, odd):
+    """Of ten; two would make the residuals of the view 18 times as large."""
+    problem, result = _adjusted(GROUP, 1.0)
+    first = problem.starts[17]
+    result.residuals_px[first : first + corners, 0] = 40.0
+    found = find_outliers(problem, result)
+    assert list(found) == ([17] if odd else [])
+    for rejection in found.values():
+        assert "residuals that are" in rejection.reason
+        # Nothing is said of heights and grids that are as those of the others.
+        assert "um of height" not in rejection.reason
+
+
 def test_where_half_of_a_magnification_disagrees_no_single_view_is_at_fault():
     residual = np.ones(24)
     residual[:2] = 10.0
