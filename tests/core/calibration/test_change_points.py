@@ -97,7 +97,7 @@ def _with_views_that_state_315(wrong):
 def test_the_one_view_beside_a_jump_that_has_a_wrong_magnification_is_left_out():
     views, result = _with_views_that_state_315(1)
     assert [o.name for o in result.outliers] == [views[1].name]
-    assert "a scale that is off by 4." in result.outliers[0].reason
+    assert "a scale that differs by 4." in result.outliers[0].reason
     # The others calibrate the rest.
     assert result.model.magnifications == (300.0, 800.0)
 
