@@ -157,6 +157,7 @@ def _contradicts(update: DriftUpdate, smoothed: DriftUpdate) -> bool:
     if not (update.accepted and np.all(np.isfinite(covariance)) and np.any(covariance)):
         return False
     if np.trace(smoothed.covariance[:2, :2]) > np.trace(covariance):
+        # The frame had too small a process noise: its own sigma is the wrong one.
         return False
     return float(apart @ solve_scaled(covariance, apart)) > INNOVATION_CHI2_MAX
 

@@ -230,8 +230,8 @@ def estimate_process_noise(
     )
     if walk_near is not None:
         middle = _as_restless(walk_near, likely.process_noise, few_frames_s).psd / walk_near.psd
-        bounds = np.log(middle) + np.array(WALK_LOG_RANGE)
-        walk = _refine(_Likelihood(start, part, walk_near), (float(bounds[0]), float(bounds[1])))
+        lowest, highest = (float(np.log(middle)) + end for end in WALK_LOG_RANGE)
+        walk = _refine(_Likelihood(start, part, walk_near), (lowest, highest))
         evidence = likely.lowest - walk.lowest
         if evidence > WALK_EVIDENCE_MIN:
             likely = walk

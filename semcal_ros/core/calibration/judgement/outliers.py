@@ -306,9 +306,7 @@ def measure_deviations(
     """
     count = len(problem.group)
     squares = whitened_norm(problem, result.residuals_px) ** 2
-    square = np.array(
-        [_trimmed_mean(own) for own in np.split(squares, np.asarray(problem.starts[1:-1]))]
-    )
+    square = np.array([_trimmed_mean(own) for own in np.split(squares, problem.starts[1:-1])])
     misfit = np.sqrt(square / max(float(np.median(square)), 1e-30))
     tilted = result.state.rotations[:, 2, 2] <= np.cos(FLAT_RAD)
     lattices = np.abs(result.state.lattices)
