@@ -48,7 +48,7 @@ class _Acquirer(CalibrationServer):
         self._begins = threading.Lock()
         self._say = say
         self._ask = ask
-        self._ended = False
+        self._ended = self._interrupted = False
         self.exit_status = _MISSED
         self._timer = self.create_timer(
             _POLL_S, self._end_if_done, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -65,6 +65,8 @@ class _Acquirer(CalibrationServer):
     def destroy_node(self) -> None:
         """Extend the base class: say how to go on with what Ctrl-C has interrupted, now that it is on the disk."""
         if not self._ended:
+            # Before the acquisition ends: the thread that follows it leaves the last word to this one.
+            self._interrupted = True
             self.exit_status = _INTERRUPTED
         super().destroy_node()
         self._tell_end()
@@ -149,6 +151,8 @@ class _Acquirer(CalibrationServer):
                     self._say(f"not taken: {error}")
                     asked = ""
             time.sleep(_POLL_S)
+        if self._interrupted:
+            return
         progress = self.acquisition.progress
         self._say(progress.text)
         self._tell_end()
