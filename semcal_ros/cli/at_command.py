@@ -172,11 +172,12 @@ def _echo_terms(described: dict[str, Any], camera: ScanCamera) -> None:
     if not has_terms(camera):
         return
     value, sigma, sizes = (described[k] for k in ("parameters", "parameter_sigma", "terms_px"))
-    if value["xi_u"]:
-        click.echo(
-            f"xi_u         {value['xi_u']:.6g} +- {sigma['xi_u']:.2g} "
-            f"(with xi_t {sizes['decentring']:.2f} px at most)"
-        )
+    for name in ("xi_u", "xi_v", "xi_w"):
+        if value[name]:
+            click.echo(
+                f"{name}         {value[name]:.6g} +- {sigma[name]:.2g} "
+                f"(all decentring {sizes['decentring']:.2f} px at most)"
+            )
     if value["xi_s"]:
         click.echo(
             f"spiral       {value['xi_s']:.6g} +- {sigma['xi_s']:.2g} "

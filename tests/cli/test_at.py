@@ -132,23 +132,24 @@ def test_each_kind_of_distortion_has_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "cal.yaml"
-    terms = {"xi_u": 0.004, "xi_s": -0.01, "coil_x2": 0.02, "coil_y3": 0.01, "settling_3": 0.02}
+    terms = {"xi_u": 0.004, "xi_w": 0.002, "xi_s": -0.01, "coil_x2": 0.02, "coil_y3": 0.01, "settling_3": 0.02}
     _with_terms(terms, field_px=0.25).save(path)
     assert run("at", path, 2000) == 0
     told = _lines_of_distortion(capsys.readouterr().out)
-    assert [line.split()[0] for line in told] == ["xi_u", "spiral", "coils", "settling", "field"]
-    assert told[0].startswith("xi_u         0.004 +- 0.0001 (with xi_t ")
-    assert told[1].startswith("spiral       -0.01 +- 0.0001 (")
+    first = [line.split()[0] for line in told]
+    assert first == ["xi_u", "xi_w", "spiral", "coils", "settling", "field"]
+    assert told[0].startswith("xi_u         0.004 +- 0.0001 (all decentring ")
+    assert told[2].startswith("spiral       -0.01 +- 0.0001 (")
     # P2 is 0.97 in the first column of 96, P3 0.94 in the first row.
-    assert told[2] == "coils        0.93 px at most along x, 0.45 px along y"
-    assert told[4] == "field        0.25 px at most, of the residual field"
+    assert told[3] == "coils        0.93 px at most along x, 0.45 px along y"
+    assert told[5] == "field        0.25 px at most, of the residual field"
     assert run("at", path, 2000, "--json") == 0
     sizes = json.loads(capsys.readouterr().out)["terms_px"]
     kinds = ["radial", "decentring", "spiral", "coils", "settling", "residual field"]
     assert list(sizes) == kinds
     assert sizes["residual field"] == pytest.approx(0.25)
-    assert f"({sizes['spiral']:.2f} px at most)" in told[1]
-    assert told[3] == f"settling     {sizes['settling']:.2f} px at most along x"
+    assert f"({sizes['spiral']:.2f} px at most)" in told[2]
+    assert told[4] == f"settling     {sizes['settling']:.2f} px at most along x"
 
 
 def test_kinds_that_are_not_there_have_no_line(

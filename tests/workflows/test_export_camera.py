@@ -82,7 +82,7 @@ def test_the_stated_difference_of_raw_images_is_the_true_one(calibration, tmp_pa
     assert done.worst_px < 0.5 * worst(ideal, camera)
 
 
-@pytest.mark.parametrize("name", ["xi_u", "xi_s", "coil_x3"])
+@pytest.mark.parametrize("name", ["xi_u", "xi_v", "xi_s", "coil_x3"])
 def test_a_camera_with_one_further_term_alone_is_no_pinhole(calibration, name):
     plain = replace(calibration.at(G), residual=None, xi_r=0.0, xi_t=0.0, skew=0.0)
     exact, nearly = (fit_pinhole(replace(plain, **{name: 0.004}, xi_r=r)) for r in (0.0, 1e-12))

@@ -17,14 +17,17 @@
 The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortion centre ``e`` and
 half the image width ``n``:
 
-    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + (xi_t + xi_u (1, -1)) * (r2 + 2 q*q) + xi_s r2 (-q_y, q_x),   r2 = |q|^2
+    f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + (xi_t + xi_u (1, -1)) * (r2 + 2 q*q)
+           + (xi_v + xi_w (1, -1)) 2 q_x q_y + xi_s r2 (-q_y, q_x),   r2 = |q|^2
 
 The radial term is the closed form of the division model (Fitzgibbon 2001,
 doi:10.1109/CVPR.2001.990465), the tangential one is the consistent reading of equation (2) of Malti
 et al. (2012), doi:10.1117/1.JEI.21.3.033020: the printed bracket adds a squared displacement vector
-to a scalar. It stands for decentring along one diagonal, and xi_u for decentring along the other. The spiral term is
-the third-order anisotropic distortion of a magnetic lens, which turns what is farther from its axis more (Hawkes and
-Kasper, Principles of Electron Optics, ch. 24).
+to a scalar. It stands for decentring along one diagonal, and xi_u for decentring along the other. A lens that is
+displaced has the products of both coordinates besides (Brown 1966, Decentering distortion of lenses): along the first
+diagonal xi_v = xi_t, along the other one xi_w = -xi_u. With the centre and the spiral term, all six quadratic patterns
+can be told. The spiral term is the third-order anisotropic distortion of a magnetic lens, which turns what is farther
+from its axis more (Hawkes and Kasper, Principles of Electron Optics, ch. 24).
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.thresholds import LENS_STEPS_MAX, LENS_TOLERANCE
 
-LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u")
+LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u", "xi_v", "xi_w")
 """The coefficients, in the order in which the functions below take and derive them."""
 
 
@@ -75,6 +78,8 @@ def distort_normalised(
     xi_t: Array | float,
     xi_s: Array | float = 0.0,
     xi_u: Array | float = 0.0,
+    xi_v: Array | float = 0.0,
+    xi_w: Array | float = 0.0,
 ) -> Array:
     """Distort (n, 2) normalised points; NaN rows where ``4 xi_r r2 >= 1``.
 
@@ -90,6 +95,10 @@ def distort_normalised(
         out += (spiral * r2)[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
     if np.any(across):
         out += across[..., None] * (r2[:, None] + 2.0 * squares) * [1.0, -1.0]
+    crossed, twisted = np.asarray(xi_v, dtype=np.float64), np.asarray(xi_w, dtype=np.float64)
+    if np.any(crossed) or np.any(twisted):
+        products = 2.0 * q[:, 0] * q[:, 1]
+        out += np.stack([(crossed + twisted) * products, (crossed - twisted) * products], axis=1)
     return out
 
 
@@ -99,13 +108,15 @@ def distort_jacobians(
     xi_t: Array | float,
     xi_s: Array | float = 0.0,
     xi_u: Array | float = 0.0,
+    xi_v: Array | float = 0.0,
+    xi_w: Array | float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Distort points, with derivatives.
 
     Returns
     -------
     f, df_dq, df_dxi
-        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 4); the last axis of ``df_dxi`` is in the order of
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 6); the last axis of ``df_dxi`` is in the order of
         :data:`LENS_NAMES`.
     """
     xi_radial = np.asarray(xi_r, dtype=np.float64)
@@ -129,6 +140,8 @@ def distort_jacobians(
     df_dxi[1] = bracket.T
     df_dxi[2, 0], df_dxi[2, 1] = -r2 * y, r2 * x
     df_dxi[3, 0], df_dxi[3, 1] = bracket[:, 0], -bracket[:, 1]
+    df_dxi[4] = 2.0 * x * y
+    df_dxi[5, 0], df_dxi[5, 1] = df_dxi[4, 0], -df_dxi[4, 1]
     spiral, across = np.asarray(xi_s, dtype=np.float64), np.asarray(xi_u, dtype=np.float64)
     if np.any(across):
         f = f + across[..., None] * df_dxi[3].T
@@ -142,6 +155,14 @@ def distort_jacobians(
         df_dq[0, 1] -= spiral * (x * x + 3.0 * y * y)
         df_dq[1, 0] += spiral * (3.0 * x * x + y * y)
         df_dq[1, 1] += 2.0 * spiral * x * y
+    crossed, twisted = np.asarray(xi_v, dtype=np.float64), np.asarray(xi_w, dtype=np.float64)
+    if np.any(crossed) or np.any(twisted):
+        f = f + crossed[..., None] * df_dxi[4].T + twisted[..., None] * df_dxi[5].T
+        of_x, of_y = 2.0 * (crossed + twisted), 2.0 * (crossed - twisted)
+        df_dq[0, 0] += of_x * y
+        df_dq[0, 1] += of_x * x
+        df_dq[1, 0] += of_y * y
+        df_dq[1, 1] += of_y * x
     return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, (0, 1), (2, 1))
 
 

@@ -95,8 +95,9 @@ class ScanCamera:
         Radial and tangential distortion in normalised coordinates.
     ex, ey
         Centre of the distortion, px.
-    xi_s, xi_u
-        Spiral distortion, and the tangential one along the other diagonal, in normalised coordinates.
+    xi_s, xi_u, xi_v, xi_w
+        Spiral distortion, the tangential one along the other diagonal, and the products of both coordinates that belong
+        to a displaced lens, in normalised coordinates (see :mod:`semcal_ros.core.camera.distortion`).
     coil_x2 to coil_x5, settling_1 to settling_5, coil_y2 to coil_y5
         Distortion of the scan along the lines and across them (see
         :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
@@ -142,6 +143,8 @@ class ScanCamera:
     residual: FieldSlice | None = None
     xi_s: float = 0.0
     xi_u: float = 0.0
+    xi_v: float = 0.0
+    xi_w: float = 0.0
     coil_x2: float = 0.0
     coil_x3: float = 0.0
     coil_x4: float = 0.0

@@ -133,6 +133,7 @@ def test_overlaps_are_the_integrals_that_they_say():
     r2 = np.sum(q * q, axis=1)
     radial, tangential = r2[:, None] * q, r2[:, None] + 2.0 * q * q
     spiral = r2[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
+    products = 2.0 * q[:, 0] * q[:, 1]
     one, zero = np.ones(len(q)), np.zeros(len(q))
     # Beyond the picture, functions of the scan go on as straight lines.
     inside, beyond = np.clip(q[:, 0], -1.0, 1.0), q[:, 0] - np.clip(q[:, 0], -1.0, 1.0)
@@ -148,6 +149,8 @@ def test_overlaps_are_the_integrals_that_they_say():
         (6 + LENS_NAMES.index("xi_t"), tangential, 1e-12),
         (6 + LENS_NAMES.index("xi_s"), spiral, 1e-12),
         (6 + LENS_NAMES.index("xi_u"), tangential * [1.0, -1.0], 1e-12),
+        (6 + LENS_NAMES.index("xi_v"), np.stack([products, products], 1), 1e-12),
+        (6 + LENS_NAMES.index("xi_w"), np.stack([products, -products], 1), 1e-12),
         (scan + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
         # A decay is no polynomial, nor a coil one beyond the picture: six nodes in each cell are not quite exact.
         (scan + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),

@@ -141,6 +141,27 @@ def test_decentring_along_the_other_diagonal_known_answer():
     np.testing.assert_allclose(both.distort([[511.5, 191.5]]), [[519.18, 191.5]], atol=1e-9)
 
 
+def test_the_products_of_both_coordinates_known_answer():
+    # q = (0.5, -0.25): 2 q_x q_y is -0.25.
+    along = replace(PLAIN, xi_v=0.01).distort([[383.5, 127.5]])
+    np.testing.assert_allclose(along, [[383.5 - 0.64, 127.5 - 0.64]], atol=1e-9)
+    across = replace(PLAIN, xi_w=0.01).distort([[383.5, 127.5]])
+    np.testing.assert_allclose(across, [[383.5 - 0.64, 127.5 + 0.64]], atol=1e-9)
+
+
+@pytest.mark.parametrize("displaced", [(0.003, 0.0), (0.0, -0.002), (0.001, 0.004)])
+def test_decentring_has_the_form_of_brown_in_any_direction(displaced):
+    """Brown 1966, with the displacement d: d r2 + 2 q (q . d)."""
+    d = np.array(displaced)
+    xi_t, xi_u = 0.5 * d.sum(), 0.5 * (d[0] - d[1])
+    camera = replace(PLAIN, xi_t=xi_t, xi_u=xi_u, xi_v=xi_t, xi_w=-xi_u)
+    xy = np.random.default_rng(0).uniform(0.0, 511.0, (50, 2))
+    q = (xy - [PLAIN.ex, PLAIN.ey]) / PLAIN.norm_px
+    brown = d * np.sum(q * q, axis=1)[:, None] + 2.0 * q * (q @ d)[:, None]
+    moved = camera.distort(xy) - PLAIN.distort(xy)
+    np.testing.assert_allclose(moved, PLAIN.norm_px * brown, atol=1e-9)
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_functions_have_no_constant_and_no_straight_line(axis):
     """So shift, scale and rotation of the picture are not theirs."""

@@ -62,6 +62,9 @@ def test_a_camera_without_distortion_has_none_of_any_kind():
         ({"xi_u": -0.01}, "decentring", 10.24 * np.sqrt(2.0) * END**2),
         # Both together are along x alone.
         ({"xi_t": 0.005, "xi_u": 0.005}, "decentring", 10.24 * END**2),
+        # Brown's along the diagonal: 0.01 (6, 6) in the corner.
+        ({"xi_t": 0.01, "xi_v": 0.01}, "decentring", 15.36 * np.sqrt(2.0) * END**2),
+        ({"xi_w": 0.01}, "decentring", 5.12 * np.sqrt(2.0) * END**2),
         # xi_s r2 (-q_y, q_x) is 0.01 * 2 (-1, 1).
         ({"xi_s": 0.01}, "spiral", 5.12 * np.sqrt(2.0) * END**3),
         # P3 and P2 are 1 at the border.
@@ -112,7 +115,7 @@ def test_the_residual_field_is_what_it_displaces():
 
 def test_all_kinds_together_are_what_the_camera_does():
     """First the lens, then the scan, then the field; to first order they add up."""
-    tiny = {"xi_r": 2e-5, "xi_t": -1e-5, "xi_s": 1e-5, "xi_u": 2e-5}
+    tiny = {"xi_r": 2e-5, "xi_t": -1e-5, "xi_s": 1e-5, "xi_u": 2e-5, "xi_v": -1e-5, "xi_w": 3e-5}
     tiny |= {"coil_x3": 1e-5, "coil_y2": -2e-5, "settling_2": 1e-5, "settling_4": -1e-5}
     camera = replace(PLAIN, ex=240.0, ey=271.0, **tiny)
     xy = np.random.default_rng(0).uniform(0.0, 511.0, (50, 2))

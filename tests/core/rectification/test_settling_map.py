@@ -41,6 +41,8 @@ SETTLING = replace(
     CAMERA,
     xi_s=-0.008,
     xi_u=0.003,
+    xi_v=-0.002,
+    xi_w=0.002,
     coil_x3=-0.006,
     coil_y2=0.004,
     settling_1=-0.005,
