@@ -30,7 +30,11 @@ from scipy.linalg import cho_factor, cho_solve
 
 from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
-from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult, residual_variance
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    BundleResult,
+    residual_variance,
+    variance_factor,
+)
 from semcal_ros.core.calibration.estimator.normal_equations import sum_by
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import (
@@ -262,9 +266,9 @@ def field_system(
     right += np.einsum("vpq,vq->vp", information, z)
     # Of each residual half the square, of which a corner has two.
     half = 0.5 * problem.dimensions
-    excess = half * np.add.reduceat(
-        result.huber_weight * (1.0 - own_variance / variance), problem.starts[:-1]
-    )
+    # A few outliers are no misfit that a field could explain.
+    beyond = (variance_factor(problem, result) - own_variance) / variance
+    excess = half * np.add.reduceat(result.huber_weight * beyond, problem.starts[:-1])
     observations = problem.dimensions * np.diff(problem.starts).astype(float)
     if not few:
         count = len(setup.magnifications)
