@@ -98,7 +98,7 @@ class ScanCamera:
     xi_s, xi_u, xi_v, xi_w
         Spiral distortion, the tangential one along the other diagonal, and the products of both coordinates that belong
         to a displaced lens, in normalised coordinates (see :mod:`semcal_ros.core.camera.distortion`).
-    coil_x2 to coil_x5, settling_1 to settling_5, coil_y2 to coil_y5
+    coil_x2 to coil_x7, settling_1 to settling_5, coil_y2 to coil_y7
         Distortion of the scan along the lines and across them (see
         :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
     raster_ratio
@@ -149,6 +149,8 @@ class ScanCamera:
     coil_x3: float = 0.0
     coil_x4: float = 0.0
     coil_x5: float = 0.0
+    coil_x6: float = 0.0
+    coil_x7: float = 0.0
     settling_1: float = 0.0
     settling_2: float = 0.0
     settling_3: float = 0.0
@@ -158,6 +160,8 @@ class ScanCamera:
     coil_y3: float = 0.0
     coil_y4: float = 0.0
     coil_y5: float = 0.0
+    coil_y6: float = 0.0
+    coil_y7: float = 0.0
     raster_ratio: float | None = None
 
     def __post_init__(self) -> None:

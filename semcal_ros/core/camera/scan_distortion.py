@@ -22,7 +22,7 @@ with the middle ``c`` of the picture along this axis, and half its width ``n``. 
 
     s(u) = sum_k a_k P_k(u) + sum_k b_k E_k(u)
 
-has Legendre polynomials P2 to P5, for coils and amplifiers that are not linear, and decays
+has Legendre polynomials P2 to P7, for coils and amplifiers that are not linear, and decays
 E_k = exp(-(1 + u) / T_k) with the time since the line began, for the settling of the beam after the flyback. A few time
 constants a factor of two apart stand for any decay. Across the lines there are the polynomials alone, of (y - c) over
 half the height.
@@ -56,6 +56,8 @@ SCAN_NAMES: tuple[str, ...] = (
     "coil_x3",
     "coil_x4",
     "coil_x5",
+    "coil_x6",
+    "coil_x7",
     "settling_1",
     "settling_2",
     "settling_3",
@@ -65,6 +67,8 @@ SCAN_NAMES: tuple[str, ...] = (
     "coil_y3",
     "coil_y4",
     "coil_y5",
+    "coil_y6",
+    "coil_y7",
 )
 """Amplitudes in half image widths: of the functions along the lines, then of those across them."""
 SETTLING = slice(SCAN_NAMES.index("settling_1"), SCAN_NAMES.index("coil_y2"))
@@ -262,6 +266,9 @@ def _kept_curve(of_axis: bytes) -> _Curve:
 def _sum_functions(of_axis: Array) -> _Curve:
     polynomials = len(LEGENDRE_POWERS)
     powers = np.tensordot(LEGENDRE_POWERS, of_axis[:polynomials], axes=(0, 0))
+    # Most cameras have no high ones, which every frame would pay for.
+    highest = int(np.max(np.flatnonzero(np.any(powers, axis=1)), initial=1))
+    powers = powers[: highest + 1]
     decays = []
     for amplitude, line, rate in zip(of_axis[polynomials:], _LINES, _RATES, strict=False):
         if np.any(amplitude):

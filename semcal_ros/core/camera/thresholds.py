@@ -146,12 +146,14 @@ SCAN_SLOPE_MAX = TABLE.stated(
 )
 LEGENDRE_POWERS = TABLE.derived(
     "LEGENDRE_POWERS", np.array([
-        [-0.5, 0.0, 1.5, 0.0, 0.0, 0.0],
-        [0.0, -1.5, 0.0, 2.5, 0.0, 0.0],
-        [0.375, 0.0, -3.75, 0.0, 4.375, 0.0],
-        [0.0, 1.875, 0.0, -8.75, 0.0, 7.875],
+        [-0.5, 0.0, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, -1.5, 0.0, 2.5, 0.0, 0.0, 0.0, 0.0],
+        [0.375, 0.0, -3.75, 0.0, 4.375, 0.0, 0.0, 0.0],
+        [0.0, 1.875, 0.0, -8.75, 0.0, 7.875, 0.0, 0.0],
+        [-0.3125, 0.0, 6.5625, 0.0, -19.6875, 0.0, 14.4375, 0.0],
+        [0.0, -2.1875, 0.0, 19.6875, 0.0, -43.3125, 0.0, 26.8125],
     ]), "1",
-    "Coefficients of the powers of u in the Legendre polynomials P2 to P5.",
+    "Coefficients of the powers of u in the Legendre polynomials P2 to P7.",
 )
 
 # Raster timing, in scan_timing.py

@@ -55,9 +55,9 @@ BENT = replace(
 WHOLE = replace(BENT, **TERMS)
 POINTS = np.random.default_rng(5).uniform((-5e-5, -3e-5, -3e-4), (5e-5, 3e-5, 3e-4), (40, 3))
 
-# The slopes of the polynomials add up to 34 at most, or to 45 where the picture is lower than wide, and those of the
+# The slopes of the polynomials add up to 83 at most, or to 111 where the picture is lower than wide, and those of the
 # decays to 165: with amplitudes up to these the beam never stands still.
-coil, settling = st.floats(-0.01, 0.01), st.floats(-0.003, 0.003)
+coil, settling = st.floats(-0.004, 0.004), st.floats(-0.003, 0.003)
 scan = st.tuples(*[settling if "settling" in name else coil for name in SCAN_NAMES]).map(np.array)
 pixels = st.lists(
     st.tuples(st.floats(-20.0, 530.0), st.floats(-20.0, 400.0)), min_size=1, max_size=20
