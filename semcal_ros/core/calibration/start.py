@@ -288,12 +288,18 @@ def _apparently_untilted(setup: Setup) -> set[int]:
 
 
 def adapt_priors(setup: Setup) -> Setup:
-    """Return the setup with priors of a photographic lens where the perspective is that strong."""
+    """Return the setup with priors of a strong perspective where the views have one.
+
+    At one magnification it is a photograph: its priors are those of a lens, whose order of distance alone is known. With
+    several it is a microscope with a field as wide as its pivot is far, whose grid, stage and scan are those of any.
+    """
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     if not start.wide:
         return setup
-    return replace(setup, priors=setup.priors.of_wide_views(start.rho))
+    if len(setup.magnifications) == 1:
+        return replace(setup, priors=setup.priors.of_photographs(start.rho))
+    return replace(setup, priors=replace(setup.priors, rho_mean=start.rho, rho_sigma=start.rho))
 
 
 def add_shared_unknowns(setup: Setup) -> Setup:

@@ -131,7 +131,7 @@ class Priors:
     untilted_sigma_rad: float = 0.0087
     is_wide: bool = False
 
-    def of_wide_views(self, rho: float) -> Priors:
+    def of_photographs(self, rho: float) -> Priors:
         """Return the priors of a lens with the pivot at ``1 / rho`` and not a few centimetres away.
 
         Only the order of magnitude of the distance and of the heights is presumed.

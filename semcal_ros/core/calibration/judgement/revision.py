@@ -159,7 +159,7 @@ def make_setup(
     )
     priors = Priors()
     if model.record is not None and model.record.is_wide:
-        priors = priors.of_wide_views(cameras[flat[0].magnification].rho)
+        priors = priors.of_photographs(cameras[flat[0].magnification].rho)
     magnifications = np.unique([v.magnification for v in flat])
     setup = Setup(flat, magnifications, image_size, model.display_width_m, priors, axis=axis)
     setup = replace(setup, raster_ratio=model.image_height / model.image_width)
