@@ -17,6 +17,7 @@
     python -m benchmarks.calibration.fleet [--count 300] [--seed 0] [--jobs 1] [--json FILE]
     python -m benchmarks.calibration.fleet --seed 0 --only 17
     python -m benchmarks.calibration.fleet --misstate [...]
+    python -m benchmarks.calibration.fleet --other-physics [...]
 
 A microscope is *raised* if its calibration raises anything, *warned* if it prints a warning of numpy, and *wrong* if
 at a magnification between the calibrated ones the error after a pose fit is beyond both 0.1 px and 4 stated sigmas, or
@@ -25,7 +26,8 @@ is wrong, and the RMS of the error over sigma of the fleet is 0.7 to 1.4, in pix
 
 `--only` repeats the one of this index, with all details. It is the same one whatever the count. With `--misstate` one
 view of each states a wrong magnification. The limit is the same, and no view may be left out but that one. That it is
-left out is no limit: what a height or a repeatability of the scale explains does no harm.
+left out is no limit: what a height or a repeatability of the scale explains does no harm. With `--other-physics` the
+same microscopes have lenses and amplifiers of other forms than the calibration's.
 """
 
 from __future__ import annotations
@@ -189,9 +191,9 @@ def line_of(own: Outcome) -> str:
     return text
 
 
-def show_one(seed: int, index: int, misstate: bool) -> None:
+def show_one(seed: int, index: int, *, misstate: bool, other_physics: bool) -> None:
     """Print everything about one microscope."""
-    own, trace = judge(seed, index, misstate=misstate)
+    own, trace = judge(seed, index, misstate=misstate, other_physics=other_physics)
     for name, value in own.microscope.items():
         print(f"{name:18s} {value}")
     print(line_of(own))
@@ -221,16 +223,20 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the fleet; default 0")
     parser.add_argument("--only", type=int, metavar="INDEX", help="one microscope, in detail")
     parser.add_argument("--misstate", action="store_true", help="one wrong magnification in each")
+    parser.add_argument("--other-physics", action="store_true", help="lenses of other forms")
     parser.add_argument("--jobs", type=int, default=1, help="processes; default 1")
     parser.add_argument("--json", type=Path, metavar="FILE", help="results of each microscope")
     given = parser.parse_args()
     if given.only is not None:
-        show_one(given.seed, given.only, given.misstate)
+        show_one(given.seed, given.only, misstate=given.misstate, other_physics=given.other_physics)
         return 0
     outcomes = []
     jobs = Parallel(n_jobs=given.jobs, return_as="generator")
     tasks = (
-        delayed(judge)(given.seed, index, misstate=given.misstate) for index in range(given.count)
+        delayed(judge)(
+            given.seed, index, misstate=given.misstate, other_physics=given.other_physics
+        )
+        for index in range(given.count)
     )
     for own, _ in jobs(tasks):
         outcomes.append(own)

@@ -23,11 +23,15 @@ meets them, so that an error in one of the two shows. A microscope depends on no
                    + c r2 (-q_y, q_x), each of k, t, c falling as exp(-g / decay)
     coils          x += A (z^3 - z + 0.4 z^2) along each axis, z from -1 to 1 across the raster
     settling       x += B exp(-column / L) along the lines: column of the picture, or of where the beam should be
+
+These are the forms that the calibration knows. Those of the other physics are not all: the lens is displaced in some
+direction d (Brown 1966: d r2 + 2 q (q . d)), its radial distortion is tan(b r) / (b r) or atan(b r) / (b r), and the
+amplifiers of the coils saturate (a tanh curve, as large).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +60,9 @@ class Microscope:
     """A microscope, its stage, and how a recording was made with it.
 
     Lengths in m and px, angles in rad. ``coil_px`` is along columns and rows; ``settles_late`` says that the settling
-    is a function of the column of the picture, which is the time since the line began.
+    is a function of the column of the picture, which is the time since the line began. The last three are of the other
+    physics: in which direction the lens is displaced, whether the radial distortion is that of an angle, and how far
+    into saturation the amplifiers go.
     """
 
     seed: int
@@ -94,6 +100,9 @@ class Microscope:
     settling_px: float
     settling_columns: float
     settles_late: bool
+    displaced_rad: float | None = None
+    by_angle: bool = False
+    saturation: float = 0.0
 
     @property
     def size(self) -> Array:
@@ -141,14 +150,40 @@ class Microscope:
         k = self.radial * np.exp(-g / self.radial_decay)
         t = self.decentring * np.exp(-g / self.decentring_decay)
         c = self.spiral * np.exp(-g / self.spiral_decay)
-        root = 1.0 - 4.0 * k * r2
-        lens = 2.0 * q / (1.0 + np.sqrt(np.where(root > 0.0, root, np.nan)))
-        lens = lens + t * (r2 + 2.0 * q * q) + c * r2 * np.stack([-q[:, 1], q[:, 0]], axis=1)
+        lens = q * self._radial(k, r2)
+        if self.displaced_rad is None:
+            lens = lens + t * (r2 + 2.0 * q * q)
+        else:
+            d = (
+                t
+                * np.sqrt(2.0)
+                * np.array([np.cos(self.displaced_rad), np.sin(self.displaced_rad)])
+            )
+            lens = lens + d * r2 + 2.0 * q * (q @ d)[:, None]
+        lens = lens + c * r2 * np.stack([-q[:, 1], q[:, 0]], axis=1)
         out = np.array(self.centre_px) + norm * lens
         z = 2.0 * (out - self.middle) / self.size
-        out = out + np.array(self.coil_px) * (z**3 - z + 0.4 * z * z)
+        out = out + np.array(self.coil_px) * (self._odd(z) + 0.4 * z * z)
         out[:, 0] = self._settle(out[:, 0])
         return out
+
+    def _radial(self, k: float, r2: Array) -> Array:
+        """By what factor a point is farther out."""
+        if not self.by_angle:
+            root = 1.0 - 4.0 * k * r2
+            return np.asarray(2.0 / (1.0 + np.sqrt(np.where(root > 0.0, root, np.nan))))
+        angle = np.sqrt(3.0 * abs(k) * r2) + 1e-9
+        return np.asarray((np.tan(angle) if k > 0.0 else np.arctan(angle)) / angle)
+
+    def _odd(self, z: Array) -> Array:
+        """What an amplifier adds to a ramp, 0 at both ends and 0.385 at most in between."""
+        if self.saturation == 0.0:
+            return z**3 - z
+        slope = np.tanh(self.saturation) / self.saturation
+        most = np.arccosh(slope**-0.5) / self.saturation
+        top = np.tanh(self.saturation * most) / np.tanh(self.saturation) - most
+        bent = np.tanh(self.saturation * z) / np.tanh(self.saturation) - z
+        return np.asarray(-2.0 / 27.0**0.5 * bent / top)
 
     def _settle(self, x: Array) -> Array:
         if self.settling_px == 0.0:
@@ -200,8 +235,21 @@ class SeenGrid:
     name: str
 
 
-def draw_microscope(seed: int, index: int) -> Microscope:
-    """The microscope of this index in the fleet of this seed."""
+def draw_microscope(seed: int, index: int, *, other_physics: bool = False) -> Microscope:
+    """The microscope of this index in the fleet of this seed, or the same one with the other physics."""
+    own = _draw_known(seed, index)
+    if not other_physics:
+        return own
+    draws = Draws(np.random.default_rng((seed, index, 4)))
+    return replace(
+        own,
+        displaced_rad=draws.between(-np.pi, np.pi),
+        by_angle=draws.either(0.5),
+        saturation=draws.between(0.8, 2.4),
+    )
+
+
+def _draw_known(seed: int, index: int) -> Microscope:
     rng = np.random.default_rng((seed, index, 0))
     draws = Draws(rng)
     between, ratio, either = draws.between, draws.ratio, draws.either

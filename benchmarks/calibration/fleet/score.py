@@ -196,12 +196,14 @@ def misstate_one(own: Microscope, views: Sequence[GridView]) -> tuple[list[GridV
     return out, chosen, factor
 
 
-def judge(seed: int, index: int, *, misstate: bool = False) -> tuple[Outcome, str]:
+def judge(
+    seed: int, index: int, *, misstate: bool = False, other_physics: bool = False
+) -> tuple[Outcome, str]:
     """The outcome of one microscope, and the traceback if there is one.
 
     With ``misstate`` the magnification of one view is wrong (:func:`misstate_one`).
     """
-    own = draw_microscope(seed, index)
+    own = draw_microscope(seed, index, other_physics=other_physics)
     views = views_of(own)
     wrong, factor = "", 1.0
     if misstate:
