@@ -194,7 +194,7 @@ class FitRecord:
     squares_m
         Sides of the squares of the grid, m; empty where they are not known.
     is_wide
-        Whether the views are those of a camera close to the grid, such as a photograph.
+        Whether the views are photographs: at one magnification, by a camera close to the grid.
     is_grating
         Whether the grid consists of parallel lines, which are turned and not tilted.
     scale_shares
