@@ -82,6 +82,12 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 from semcal_ros.core.errors import UnusableCalibrationError
 
+FIRST_TERMS: tuple[str, ...] = tuple(
+    name for name in TERM_NAMES if name not in ("xi_v", "xi_w")
+)
+"""The terms that may be there from the start. The products of both coordinates are like another centre of the
+distortion, so that where a fit began would decide between them."""
+
 # What a function may be: a polynomial in log g or in g.
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
 
@@ -394,7 +400,9 @@ def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, 
             break
         level, noisy = excess, tempered(setup, excess)
         spread = update_components(noisy, adjustment.problem, adjustment.result)
-        adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
+        adjustment = select_and_adjust(
+            noisy, adjustment.functions, adjustment.result.state, spread, offered=FIRST_TERMS
+        )
     return noisy, adjustment
 
 
@@ -406,20 +414,18 @@ def select_and_adjust(
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
     always: Sequence[str] = SMOOTH,
-    choose_terms: bool = True,
+    offered: Sequence[str] = TERM_NAMES,
 ) -> Adjustment:
-    """Choose the number of coefficients of every function, and further terms of the camera, until the choice no longer
-    changes.
-
-    Beside a residual field the terms stay as they are, since it takes the place of those that are not there.
+    """Choose the number of coefficients of every function, and further terms of the camera of those that are offered,
+    until the choice no longer changes.
     """
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
     terms: tuple[str, ...] = ()
-    if choose_terms and not setup.priors.is_wide:
-        terms = tuple(name for name in TERM_NAMES if name not in always)
+    if not setup.priors.is_wide:
+        terms = tuple(name for name in offered if name not in always)
     while rounds < CHOICE_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=(*always, *terms))
@@ -506,7 +512,8 @@ def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: b
     state = replace(adjustment.result.state, theta=theta)
     if choosing:
         sizes = _current_sizes(adjustment)
-        return select_and_adjust(setup, functions, state, spread, sizes, choose_terms=False)
+        # The field takes the place of the terms that are not there.
+        return select_and_adjust(setup, functions, state, spread, sizes, offered=())
     problem = build_problem(setup, functions, setup.views, spread)
     result = refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
@@ -547,8 +554,12 @@ def select(started: Start, residual: str) -> Selection:
         Whether there may be a residual field: ``"on"``, ``"off"``, or ``"auto"``, where cross-validation decides.
     """
     setup, noisy = started.setup, started.tempered
-    adjustment = select_and_adjust(noisy, started.functions, started.state, started.spread)
+    adjustment = select_and_adjust(
+        noisy, started.functions, started.state, started.spread, offered=FIRST_TERMS
+    )
     noisy, adjustment = _anneal(setup, noisy, adjustment)
+    spread = update_components(noisy, adjustment.problem, adjustment.result)
+    adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
     field, pattern = None, None
     if residual != "off":
         adjustment, field, pattern = _add_field(noisy, adjustment, residual == "on")

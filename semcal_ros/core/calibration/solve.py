@@ -75,7 +75,7 @@ from semcal_ros.core.calibration.thresholds import (
     UPDATE_PREDICTED,
     UPDATE_TOLERANCE,
 )
-from semcal_ros.core.camera.calibration_model import with_coefficients
+from semcal_ros.core.camera.calibration_model import TERM_NAMES, with_coefficients
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
@@ -202,7 +202,7 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         spread,
         # A field takes the place of what is not there.
         always=SMOOTH_AT_LAST if field is None else SMOOTH,
-        choose_terms=field is None,
+        offered=TERM_NAMES if field is None else (),
     )
     adjustment = _adjust_exactly(final, adjustment)
     _refuse_lost_corners(final, adjustment)
