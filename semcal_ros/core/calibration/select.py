@@ -25,6 +25,7 @@ by tilts. A residual field comes last, for what all terms leave.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -82,11 +83,9 @@ from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 from semcal_ros.core.errors import UnusableCalibrationError
 
-FIRST_TERMS: tuple[str, ...] = tuple(
-    name for name in TERM_NAMES if name not in ("xi_v", "xi_w")
-)
-"""The terms that may be there from the start. The products of both coordinates are like another centre of the
-distortion, so that where a fit began would decide between them."""
+PRODUCTS: tuple[str, ...] = ("xi_v", "xi_w")
+"""Products of both coordinates. With a radial distortion they are much like another centre, so that where a fit began
+would decide between the two: they are added only for what all others leave."""
 
 # What a function may be: a polynomial in log g or in g.
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
@@ -400,9 +399,7 @@ def _anneal(setup: Setup, noisy: Setup, adjustment: Adjustment) -> tuple[Setup, 
             break
         level, noisy = excess, tempered(setup, excess)
         spread = update_components(noisy, adjustment.problem, adjustment.result)
-        adjustment = select_and_adjust(
-            noisy, adjustment.functions, adjustment.result.state, spread, offered=FIRST_TERMS
-        )
+        adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
     return noisy, adjustment
 
 
@@ -414,18 +411,22 @@ def select_and_adjust(
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
     always: Sequence[str] = SMOOTH,
-    offered: Sequence[str] = TERM_NAMES,
+    choose_terms: bool = True,
 ) -> Adjustment:
-    """Choose the number of coefficients of every function, and further terms of the camera of those that are offered,
-    until the choice no longer changes.
+    """Choose the number of coefficients of every function, and further terms of the camera but for the
+    :data:`PRODUCTS`, until the choice no longer changes.
+
+    Products that are there stay. Beside a residual field the terms stay as they are, since it takes the place of those
+    that are not there.
     """
+    always = (*always, *(name for name in PRODUCTS if name in functions))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
     terms: tuple[str, ...] = ()
-    if not setup.priors.is_wide:
-        terms = tuple(name for name in offered if name not in always)
+    if choose_terms and not setup.priors.is_wide:
+        terms = tuple(name for name in TERM_NAMES if name not in (*always, *PRODUCTS))
     while rounds < CHOICE_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=(*always, *terms))
@@ -444,6 +445,39 @@ def select_and_adjust(
         result = refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
     return Adjustment(functions, problem, result, spread, rounds, converged)
+
+
+def add_products(
+    setup: Setup, adjustment: Adjustment, *, always: Sequence[str] = SMOOTH
+) -> Adjustment:
+    """Return the adjustment with those :data:`PRODUCTS` that explain what it leaves; unchanged where none does.
+
+    All other functions keep their numbers of coefficients while these are judged, and choose them again after it.
+    """
+    functions, spread = adjustment.functions, adjustment.spread
+    offered = [name for name in PRODUCTS if name not in functions]
+    if setup.priors.is_wide or not offered:
+        return adjustment
+    every = build_problem(setup, functions, setup.views, spread, candidates=PRODUCTS)
+    summary = Summary.of(every, refine(every, adjustment.result.state, max_iterations=0))
+    candidates = Candidates(summary, setup, functions, PRODUCTS)
+    now = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
+    most = min(SCAN_SIZE_MAX, max(len(setup.magnifications) - 1, 1))
+    costs = {}
+    for counts in itertools.product(range(most + 1), repeat=len(offered)):
+        sizes = now | dict.fromkeys(PRODUCTS, ("chebyshev_log", 0)) | now
+        sizes |= {
+            name: ("chebyshev_log", count) for name, count in zip(offered, counts, strict=True)
+        }
+        costs[counts] = candidates.score(sizes) + sum(_price(count) for count in counts)
+    best = min(costs, key=lambda counts: costs[counts])
+    if not any(best):
+        return adjustment
+    added = {
+        name: ("chebyshev_log", count) for name, count in zip(offered, best, strict=True) if count
+    }
+    functions = refit_functions(functions, now | added)
+    return select_and_adjust(setup, functions, adjustment.result.state, spread, always=always)
 
 
 def _grid_pattern(setup: Setup, adjustment: Adjustment, field: ResidualField) -> GridPattern | None:
@@ -512,8 +546,7 @@ def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: b
     state = replace(adjustment.result.state, theta=theta)
     if choosing:
         sizes = _current_sizes(adjustment)
-        # The field takes the place of the terms that are not there.
-        return select_and_adjust(setup, functions, state, spread, sizes, offered=())
+        return select_and_adjust(setup, functions, state, spread, sizes, choose_terms=False)
     problem = build_problem(setup, functions, setup.views, spread)
     result = refine_coarsely(problem, state)
     functions = with_coefficients(functions, result.state.theta)
@@ -554,12 +587,11 @@ def select(started: Start, residual: str) -> Selection:
         Whether there may be a residual field: ``"on"``, ``"off"``, or ``"auto"``, where cross-validation decides.
     """
     setup, noisy = started.setup, started.tempered
-    adjustment = select_and_adjust(
-        noisy, started.functions, started.state, started.spread, offered=FIRST_TERMS
-    )
+    adjustment = select_and_adjust(noisy, started.functions, started.state, started.spread)
     noisy, adjustment = _anneal(setup, noisy, adjustment)
-    spread = update_components(noisy, adjustment.problem, adjustment.result)
-    adjustment = select_and_adjust(noisy, adjustment.functions, adjustment.result.state, spread)
+    more = add_products(noisy, adjustment)
+    if more is not adjustment:
+        noisy, adjustment = _anneal(setup, noisy, more)
     field, pattern = None, None
     if residual != "off":
         adjustment, field, pattern = _add_field(noisy, adjustment, residual == "on")

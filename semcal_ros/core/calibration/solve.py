@@ -65,7 +65,7 @@ from semcal_ros.core.calibration.estimator.variance_components import (
     limit_components,
     update_components,
 )
-from semcal_ros.core.calibration.select import Selection, select_and_adjust
+from semcal_ros.core.calibration.select import Selection, add_products, select_and_adjust
 from semcal_ros.core.calibration.start import with_excess
 from semcal_ros.core.calibration.thresholds import (
     EXACT_STEPS_MAX,
@@ -75,7 +75,7 @@ from semcal_ros.core.calibration.thresholds import (
     UPDATE_PREDICTED,
     UPDATE_TOLERANCE,
 )
-from semcal_ros.core.camera.calibration_model import TERM_NAMES, with_coefficients
+from semcal_ros.core.camera.calibration_model import with_coefficients
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.errors import UnusableCalibrationError
 
@@ -202,8 +202,10 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         spread,
         # A field takes the place of what is not there.
         always=SMOOTH_AT_LAST if field is None else SMOOTH,
-        offered=TERM_NAMES if field is None else (),
+        choose_terms=field is None,
     )
+    if field is None:
+        adjustment = add_products(final, adjustment, always=SMOOTH_AT_LAST)
     adjustment = _adjust_exactly(final, adjustment)
     _refuse_lost_corners(final, adjustment)
     if field is not None:

@@ -290,7 +290,7 @@ def _apparently_untilted(setup: Setup) -> set[int]:
 def adapt_priors(setup: Setup) -> Setup:
     """Return the setup with priors of a strong perspective where the views have one.
 
-    At one magnification it is a photograph: its priors are those of a lens, whose order of distance alone is known. With
+    At one magnification it is a photograph: its priors are those of a lens of whose distance the order is known. With
     several it is a microscope with a field as wide as its pivot is far, whose grid, stage and scan are those of any.
     """
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))

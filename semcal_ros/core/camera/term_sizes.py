@@ -36,7 +36,11 @@ TERM_KINDS: tuple[str, ...] = (
     "residual field",
 )
 """The kinds of distortion: of the lens, of the scan, and what both leave."""
-_LENS_KINDS = {"radial": ("xi_r",), "decentring": ("xi_t", "xi_u", "xi_v", "xi_w"), "spiral": ("xi_s",)}
+_LENS_KINDS = {
+    "radial": ("xi_r",),
+    "decentring": ("xi_t", "xi_u", "xi_v", "xi_w"),
+    "spiral": ("xi_s",),
+}
 
 
 def has_terms(camera: ScanCamera) -> bool:
