@@ -132,7 +132,14 @@ def test_each_kind_of_distortion_has_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "cal.yaml"
-    terms = {"xi_u": 0.004, "xi_w": 0.002, "xi_s": -0.01, "coil_x2": 0.02, "coil_y3": 0.01, "settling_3": 0.02}
+    terms = {
+        "xi_u": 0.004,
+        "xi_w": 0.002,
+        "xi_s": -0.01,
+        "coil_x2": 0.02,
+        "coil_y3": 0.01,
+        "settling_3": 0.02,
+    }
     _with_terms(terms, field_px=0.25).save(path)
     assert run("at", path, 2000) == 0
     told = _lines_of_distortion(capsys.readouterr().out)

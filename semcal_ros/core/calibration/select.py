@@ -488,7 +488,7 @@ def _grid_pattern(setup: Setup, adjustment: Adjustment, field: ResidualField) ->
 
 
 def _add_field(
-    setup: Setup, adjustment: Adjustment, always: bool
+    setup: Setup, adjustment: Adjustment, *, always: bool
 ) -> tuple[Adjustment, FittedField | None, GridPattern | None]:
     """Add a residual field, or return the adjustment unchanged where it is not worthwhile.
 
@@ -589,10 +589,17 @@ def select(started: Start, residual: str) -> Selection:
     setup, noisy = started.setup, started.tempered
     adjustment = select_and_adjust(noisy, started.functions, started.state, started.spread)
     noisy, adjustment = _anneal(setup, noisy, adjustment)
+    field, pattern = None, None
+    if residual == "on":
+        adjustment, field, pattern = _add_field(noisy, adjustment, always=True)
+        return Selection(setup, adjustment, field, pattern, excess_px(setup, adjustment))
+    plain = noisy, adjustment
     more = add_products(noisy, adjustment)
     if more is not adjustment:
         noisy, adjustment = _anneal(setup, noisy, more)
-    field, pattern = None, None
-    if residual != "off":
-        adjustment, field, pattern = _add_field(noisy, adjustment, residual == "on")
+    if residual == "auto":
+        adjustment, field, pattern = _add_field(noisy, adjustment, always=False)
+        if field is not None and more is not plain[1]:
+            # What the products stood for is a part of what the field describes, which has them among its patterns.
+            adjustment, field, pattern = _add_field(*plain, always=True)
     return Selection(setup, adjustment, field, pattern, excess_px(setup, adjustment))

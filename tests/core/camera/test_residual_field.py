@@ -115,7 +115,8 @@ def test_beyond_the_range_the_field_of_the_nearer_end_holds():
 def test_overlaps_are_the_integrals_that_they_say():
     field = _field(3)
     overlaps = field.overlaps()
-    scan = 6 + len(LENS_NAMES)
+    # A camera with a field has no products of both coordinates, which are the last ones of the lens.
+    scan = 6 + LENS_NAMES.index("xi_v")
     assert overlaps.shape == (scan + len(SCAN_NAMES), field.slice_size)
     rows = overlaps @ field.at(1000.0).coefficients.ravel()
     # Gauss nodes, thirty between knots and the borders of the picture: there, fields and patterns are smooth.
@@ -133,7 +134,6 @@ def test_overlaps_are_the_integrals_that_they_say():
     r2 = np.sum(q * q, axis=1)
     radial, tangential = r2[:, None] * q, r2[:, None] + 2.0 * q * q
     spiral = r2[:, None] * np.stack([-q[:, 1], q[:, 0]], axis=1)
-    products = 2.0 * q[:, 0] * q[:, 1]
     one, zero = np.ones(len(q)), np.zeros(len(q))
     # Beyond the picture, functions of the scan go on as straight lines.
     inside, beyond = np.clip(q[:, 0], -1.0, 1.0), q[:, 0] - np.clip(q[:, 0], -1.0, 1.0)
@@ -149,8 +149,6 @@ def test_overlaps_are_the_integrals_that_they_say():
         (6 + LENS_NAMES.index("xi_t"), tangential, 1e-12),
         (6 + LENS_NAMES.index("xi_s"), spiral, 1e-12),
         (6 + LENS_NAMES.index("xi_u"), tangential * [1.0, -1.0], 1e-12),
-        (6 + LENS_NAMES.index("xi_v"), np.stack([products, products], 1), 1e-12),
-        (6 + LENS_NAMES.index("xi_w"), np.stack([products, -products], 1), 1e-12),
         (scan + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
         # A decay is no polynomial, nor a coil one beyond the picture: six nodes in each cell are not quite exact.
         (scan + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),
