@@ -72,6 +72,7 @@ from semcal_ros.core.calibration.thresholds import (
     FIELD_ROUNDS,
     FIELD_SETTLED_PX,
     FREE_ROUNDS,
+    PRODUCT_GAIN,
     SCAN_SIZE_MAX,
     SIZE_MAX,
     TERM_GAIN,
@@ -469,7 +470,9 @@ def add_products(
         sizes |= {
             name: ("chebyshev_log", count) for name, count in zip(offered, counts, strict=True)
         }
-        costs[counts] = candidates.score(sizes) + sum(_price(count) for count in counts)
+        costs[counts] = candidates.score(sizes) + sum(
+            PRODUCT_GAIN + COEFFICIENT_GAIN * (count - 1) for count in counts if count
+        )
     best = min(costs, key=lambda counts: costs[counts])
     if not any(best):
         return adjustment
