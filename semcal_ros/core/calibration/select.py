@@ -80,13 +80,10 @@ from semcal_ros.core.calibration.thresholds import (
 from semcal_ros.core.calibration.views import estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES, with_coefficients
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.distortion import PRODUCTS
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 from semcal_ros.core.errors import UnusableCalibrationError
-
-PRODUCTS: tuple[str, ...] = ("xi_v", "xi_w")
-"""Products of both coordinates. With a radial distortion they are much like another centre, so that where a fit began
-would decide between the two: they are added only for what all others leave."""
 
 # What a function may be: a polynomial in log g or in g.
 _POLYNOMIALS = ("chebyshev_log", "chebyshev")
@@ -365,9 +362,9 @@ def _cost(option: tuple[str, int]) -> float:
     return COEFFICIENT_GAIN * (size + (kind != "chebyshev_log"))
 
 
-def _price(size: int) -> float:
-    """Return what a term of so many coefficients must gain."""
-    return 0.0 if size == 0 else TERM_GAIN + COEFFICIENT_GAIN * (size - 1)
+def _price(size: int, first: float = TERM_GAIN) -> float:
+    """Return what a term of so many coefficients must gain, ``first`` for the first of them."""
+    return 0.0 if size == 0 else first + COEFFICIENT_GAIN * (size - 1)
 
 
 def _moves(
@@ -453,7 +450,9 @@ def add_products(
 ) -> Adjustment:
     """Return the adjustment with those :data:`PRODUCTS` that explain what it leaves; unchanged where none does.
 
-    All other functions keep their numbers of coefficients while these are judged, and choose them again after it.
+    With a radial distortion they are much like another centre, so that offered with all other terms, where a fit began
+    would decide between the two. All other functions keep their numbers of coefficients while these are judged, and
+    choose them again after it.
     """
     functions, spread = adjustment.functions, adjustment.spread
     offered = [name for name in PRODUCTS if name not in functions]
@@ -464,22 +463,17 @@ def add_products(
     candidates = Candidates(summary, setup, functions, PRODUCTS)
     now = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
     most = min(SCAN_SIZE_MAX, max(len(setup.magnifications) - 1, 1))
-    costs = {}
-    for counts in itertools.product(range(most + 1), repeat=len(offered)):
-        sizes = now | dict.fromkeys(PRODUCTS, ("chebyshev_log", 0)) | now
-        sizes |= {
-            name: ("chebyshev_log", count) for name, count in zip(offered, counts, strict=True)
-        }
-        costs[counts] = candidates.score(sizes) + sum(
-            PRODUCT_GAIN + COEFFICIENT_GAIN * (count - 1) for count in counts if count
-        )
-    best = min(costs, key=lambda counts: costs[counts])
-    if not any(best):
+    tried = [
+        dict(zip(offered, (("chebyshev_log", count) for count in counts), strict=True))
+        for counts in itertools.product(range(most + 1), repeat=len(offered))
+    ]
+    prices = [sum(_price(count, PRODUCT_GAIN) for _, count in added.values()) for added in tried]
+    costs = [candidates.score(now | added) + own for added, own in zip(tried, prices, strict=True)]
+    best = tried[int(np.argmin(costs))]
+    if not any(count for _, count in best.values()):
         return adjustment
-    added = {
-        name: ("chebyshev_log", count) for name, count in zip(offered, best, strict=True) if count
-    }
-    functions = refit_functions(functions, now | added)
+    # Without coefficients there is no function.
+    functions = refit_functions(functions, now | best)
     return select_and_adjust(setup, functions, adjustment.result.state, spread, always=always)
 
 

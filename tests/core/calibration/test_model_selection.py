@@ -25,7 +25,8 @@ import pytest
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup, constant_functions
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.pipeline import calibrate_views
-from semcal_ros.core.calibration.select import PRODUCTS, Candidates, Summary, select_functions
+from semcal_ros.core.calibration.select import Candidates, Summary, select_functions
+from semcal_ros.core.camera.distortion import PRODUCTS
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import grid_views
