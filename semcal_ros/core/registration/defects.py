@@ -158,6 +158,8 @@ class _Candidate:
         (rows, cols) mean squared residuals of all tiles of the reference; NaN where none were compared.
     structure
         (rows, cols) variance of what the reference shows in them, in grey levels of the image.
+    brightness
+        (rows, cols) mean grey level of the reference in them.
     counted
         (rows, cols) the tiles that show the lattice there.
     products
@@ -169,6 +171,7 @@ class _Candidate:
     alignment: Alignment
     energies: Array
     structure: Array
+    brightness: Array
     counted: Mask
     products: float
     is_held: bool = False
@@ -294,6 +297,7 @@ def _compare_shifts(
 ) -> list[_Candidate]:
     """Shifts of the class, each refined by what shows the lattice."""
     level, along = shown.level, _along_lines(shown.level)
+    brightness = level.normal_matrices[..., 2, 3] / level.pixel_counts
     compared: list[_Candidate] = []
     for shift in shifts:
         found = _refine(pyramid, shift, noise, shown)
@@ -314,7 +318,9 @@ def _compare_shifts(
         counted = shown.at(found.shift_px)
         # Of a tile that smoothing leaves with less than one, as of one.
         products = max(1.0, median(tiles.pixels) / shared_pixels(tiles.sigma_px))
-        compared.append(_Candidate(found, energies, structure, counted, products, is_held))
+        compared.append(
+            _Candidate(found, energies, structure, brightness, counted, products, is_held)
+        )
     return compared
 
 
@@ -502,9 +508,31 @@ def _weigh(first: _Candidate, second: _Candidate) -> tuple[float, float]:
     finite = np.isfinite(difference) & first.counted & second.counted
     if not np.any(finite):
         return 0.0, 0.0
-    left = np.where(finite, difference - float(np.median(difference[finite])), 0.0)
+    # At the better of the two shifts a tile has its noise, and nothing else.
+    least = np.minimum(first.energies, second.energies)
+    relative = difference[finite] / _noise_by_brightness(least[finite], first.brightness[finite])
+    left = np.zeros(difference.shape)
+    left[finite] = relative - float(np.median(relative))
     deviations = normal_deviations(left / max(mad_sigma(left[finite]), 1e-30), first.products)
     return _count_defects(deviations), _count_defects(-deviations)
+
+
+def _noise_by_brightness(energies: Array, brightness: Array) -> Array:
+    """(n,) energies that noise alone leaves in tiles of so much brightness: a straight line through medians of the
+    darker and of the brighter third (the resistant line of Tukey, Exploratory Data Analysis, 1977, chapter 5).
+
+    Electrons scatter more where it is bright: beside the noise of dark tiles, that of bright ones would be a defect.
+    """
+    middle = max(float(np.median(energies)), 1e-30)
+    low, high = np.quantile(brightness, [1.0 / 3.0, 2.0 / 3.0])
+    if not high > low:
+        return np.full(len(energies), middle)
+    dark, bright = brightness <= low, brightness >= high
+    places = [float(np.median(brightness[part])) for part in (dark, bright)]
+    levels = [float(np.median(energies[part])) for part in (dark, bright)]
+    slope = max(0.0, (levels[1] - levels[0]) / (places[1] - places[0]))
+    line = levels[0] + slope * (brightness - places[0])
+    return np.maximum(line, max(min(levels), 1e-6 * middle))
 
 
 def _count_defects(deviations: Array) -> float:

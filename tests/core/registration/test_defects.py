@@ -154,7 +154,7 @@ def test_defects_that_are_left_unexplained_ask_for_more_evidence() -> None:
         found = align([level], pyramid, start)
         assert isinstance(found, Alignment)
         zeros, ones = np.zeros(everywhere.shape), np.ones(everywhere.shape)
-        candidate = _Candidate(found, zeros, ones, everywhere, 10.0)
+        candidate = _Candidate(found, zeros, ones, zeros, everywhere, 10.0)
         least.append(_find_least_evidence(candidate, _count_left_defects(candidate, noise), False))
     # Two defects, and one more than the four that the second shift does not explain.
     assert least[0] == EVIDENCE_MIN
@@ -250,17 +250,20 @@ def test_long_tails_of_mean_squares_are_known(products: int) -> None:
     assert expected[3] < 4.6
 
 
-def test_chance_is_no_defect() -> None:
+@pytest.mark.parametrize("brightest", [1.0, 6.0])
+def test_chance_is_no_defect(brightest: float) -> None:
     """Mean squares of 15 values in 784 tiles: some fifteen of all stand out by 5 robust sigmas, though of normal ones
-    hardly any would.
+    hardly any would. Bright tiles have more noise: half of them up to six times as much as the darkest.
     """
     tiles, everywhere = (500, 28, 28), np.ones((28, 28), dtype=bool)
     rng = np.random.default_rng(1)
-    first, second = rng.chisquare(15.0, (2, *tiles)) / 15.0
+    squares = rng.chisquare(15.0, (2, *tiles)) / 15.0
+    noise = np.where(rng.random((28, 28)) < 0.6, 1.0, rng.uniform(1.0, brightest, (28, 28)))
+    brightness = 40.0 * noise + 7.0
     alignment = cast("Alignment", None)
     evidence = 0.0
-    for pair in zip(first, second, strict=True):
-        shifts = [_Candidate(alignment, own, own, everywhere, 15.0) for own in pair]
+    for pair in zip(*(noise * squares), strict=True):
+        shifts = [_Candidate(alignment, own, own, brightness, everywhere, 15.0) for own in pair]
         evidence += sum(_weigh(*shifts))
     # A quarter of a tile is expected; more than three are seen once in ten thousand times.
     assert evidence <= 3.0 * DEFECT_EVIDENCE_MAX
