@@ -26,7 +26,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
-    residual_variance,
     variance_factor,
 )
 from semcal_ros.core.calibration.estimator.posterior import CovarianceParts, certify
@@ -282,15 +281,15 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     factor = variance_factor(adjustment.problem, result)
     findings = []
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
-    misfit = np.sqrt(residual_variance(adjustment.problem, result)) * np.hypot(
-        1.0, fit.excess_px / own_px
-    )
+    # By scores: a few outliers are no misfit of functions.
+    misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
     if misfit > MISFIT_MAX:
         excess_px, excess_at = measure_excess(setup, fit)
         findings.append(
             Finding(
                 f"scale: residuals are {misfit:.1f} times what the uncertainty of the corners explains: the functions "
-                "do not follow the microscope everywhere, or the grid is not regular"
+                "do not follow the microscope everywhere, the grid is not regular, or the corners are less certain "
+                "than stated"
                 + ("; record more magnifications" if len(setup.magnifications) > 1 else ""),
                 excess_px,
                 magnification=excess_at,

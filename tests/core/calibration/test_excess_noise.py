@@ -67,9 +67,16 @@ def test_excess_is_added_to_every_corner():
     np.testing.assert_allclose(wider.covariance_px2, view.covariance_px2 + 0.09 * np.eye(2))
 
 
+def _put_some_elsewhere(xy, rng):
+    """Corners (n, 2), one in a hundred of which is 1.5 px off."""
+    off = rng.normal(size=xy.shape)
+    off *= 1.5 / np.linalg.norm(off, axis=1, keepdims=True)
+    return np.where(rng.random((len(xy), 1)) < 0.01, xy + off, xy)
+
+
 @pytest.mark.slow
 @pytest.mark.long
-def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
+def test_an_uneven_board_is_told_and_counts_in_the_uncertainty_and_a_few_outliers_do_not():
     microscope = preset("jsm820")
     rng = np.random.default_rng(2)
     magnifications = [100.0, 400.0, 1500.0, 5000.0]
@@ -95,6 +102,11 @@ def test_an_uneven_board_is_told_and_counts_in_the_uncertainty():
     assert bad.model.statistics["fit"]["excess_sigma_px"] == pytest.approx(0.2, rel=0.06)
     assert not any("residuals are" in w for w in good.warnings)
     assert any("residuals are 10" in w or "residuals are 9" in w for w in bad.warnings)
+    # One corner in a hundred that is somewhere else is no misfit of functions: it is in the weights.
+    wrong = [replace(v, image_xy=_put_some_elsewhere(v.image_xy, rng)) for v in even]
+    few = calibrate_views(wrong, **options)
+    assert few.model.statistics["fit"]["excess_sigma_px"] == 0.0
+    assert not any("residuals are" in w for w in few.warnings)
     # Where there are views, ten times the scatter makes what only the corners determine much less
     # certain: the distortion. Aspect and skew are limited by the drift and the tilts, too.
     sigma = [np.sqrt(np.diag(r.model.at(1500.0).covariance)[[6, 7]]) for r in (good, bad)]
