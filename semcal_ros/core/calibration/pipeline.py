@@ -166,7 +166,7 @@ def calibrate_views(
     is_optional = any(view.has_stage_tilt for view in views) and are_enough(bare, options)
     failed: CalibrationError | None = None
     try:
-        joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+        joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
         contradiction = _find_contradicted_stage(views, setup)
         if not contradiction:
             notes += [*_find_turned_axis(views, setup, joint), *lines]
@@ -186,7 +186,7 @@ def calibrate_views(
         )
     try:
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
-        joint, setup, outliers, notes = _fit_without_outliers(setup, options.residual, on_stage)
+        joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
         notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
         return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
     except CalibrationError as error:
@@ -397,26 +397,32 @@ def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> t
 
 
 def _fit_without_outliers(
-    setup: Setup, residual: str, on_stage: Callable[[str, float], None]
+    setup: Setup, options: CalibrationOptions, on_stage: Callable[[str, float], None]
 ) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[Finding]]:
     """Fit without the views, and the readings of tilts, that disagree with the others.
 
-    Also returns those views, and a finding for each reading. It ends before that where the views contradict most of the
-    stage's tilts, since those that are left are wrong as well, by less.
+    Also returns those views, and a finding for each reading; that a view is no longer guessed to be untilted is none.
+    It ends before that where the views contradict most of the stage's tilts, since those that are left are wrong as
+    well, by less.
     """
     outliers: list[RejectedView] = []
     notes: dict[str, Finding] = {}
     given = {view.name: view for view in setup.views}
     believed_again: set[str] = set()
+
+    def say(found: Mapping[str, Finding]) -> list[Finding]:
+        is_told = options.untilted != "auto"
+        return [note for name, note in found.items() if is_told or given[name].has_stage_tilt]
+
     while True:
-        fit = fit_joint(setup, residual, on_stage)
+        fit = fit_joint(setup, options.residual, on_stage)
         wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
         found = _find_outlier_of_few(setup) if wrong or _is_irregular(setup, fit) else {}
         if wrong and not found:
             setup, own = _without_tilts(setup, wrong)
             notes |= own
             if _find_contradicted_stage(list(given.values()), setup):
-                return fit, setup, tuple(outliers), list(notes.values())
+                return fit, setup, tuple(outliers), say(notes)
             continue
         found = (
             found
@@ -433,7 +439,7 @@ def _fit_without_outliers(
                 setup = add_shared_unknowns(replace(setup, views=views))
                 notes = {name: note for name, note in notes.items() if name not in again}
                 continue
-            return fit, setup, tuple(outliers), list(notes.values())
+            return fit, setup, tuple(outliers), say(notes)
         outliers += [
             RejectedView(setup.views[v].name, setup.views[v].magnification, rejection)
             for v, rejection in found.items()
@@ -441,7 +447,7 @@ def _fit_without_outliers(
         # Views become fewer, and a reading is believed again once, so this loop ends.
         views = tuple(v for i, v in enumerate(setup.views) if i not in found)
         if not views:
-            return fit, setup, tuple(outliers), list(notes.values())
+            return fit, setup, tuple(outliers), say(notes)
         # A magnification of which no view is left is not calibrated.
         magnifications = np.unique([v.magnification for v in views])
         setup = replace(setup, views=views, magnifications=magnifications)

@@ -142,6 +142,19 @@ def test_views_that_are_named_untilted_and_tilted_by_the_stage_are_said(untilted
         assert f"by {np.degrees(max(tilts.values())):.1f} degrees" in said[0]
 
 
+@pytest.mark.long
+def test_a_view_that_is_not_untilted_is_said_where_somebody_named_it_so():
+    stage = replace(ANY_WAY, tilts_rad=(0.16, 0.45, 0.65))
+    views = stage_views(MICROSCOPE.camera_at, (500.0, 1000.0), stage, most_corners=60)
+    lowest = views[0].name
+    for untilted in ("auto", (lowest,)):
+        result = calibrated(views, untilted=untilted)
+        said = [w for w in result.warnings if "contradicts untilted" in w]
+        # A guess that the views refute is no news.
+        assert len(said) == (untilted != "auto")
+        assert not said or said[0].startswith(f"scale: {lowest} at magnification 500")
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_wavy_grid_is_the_grids_and_no_residual_field():
