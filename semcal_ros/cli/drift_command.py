@@ -85,7 +85,8 @@ def command(
     """Drift of the specimen in RECORDING at the centre of each frame, relative to the first one.
 
     What lay at X in the sem frame is seen at X + drift. Columns: stamp_ns, dx_m, dy_m, sigma_x_m, sigma_y_m,
-    dx_px, dy_px (rectified pixels), sigma_x_px, sigma_y_px (without that of the scale), status.
+    dx_px, dy_px (rectified pixels), sigma_x_px, sigma_y_px (without that of the scale), status, correlation_m and
+    correlation_px (of x and y).
 
     \b
     Example:

@@ -38,6 +38,8 @@ DRIFT_COLUMNS = (
     "sigma_x_px",
     "sigma_y_px",
     "status",
+    "correlation_m",
+    "correlation_px",
 )
 """Columns of ``drift.csv``."""
 

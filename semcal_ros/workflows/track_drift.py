@@ -127,6 +127,8 @@ class DriftTrack:
                 *drift.drift_px[k],
                 *drift[k].sigma_px,
                 drift[k].status_text,
+                _correlation(drift[k].covariance[:2, :2]),
+                _correlation(drift[k].covariance_px2),
             )
             for k, stamp_ns in enumerate(self.stamps_ns)
         ]
@@ -137,6 +139,14 @@ class DriftTrack:
             turns = [np.column_stack(pair).ravel() for pair in pairs]
             rows = [(*row, *turn) for row, turn in zip(rows, turns, strict=True)]
         write_table(Path(path), columns, rows)
+
+
+def _correlation(covariance: Array) -> float:
+    """Return the correlation of x and y of a (2, 2) covariance; 0 where one of them is exact or unknown."""
+    sigma = np.sqrt(np.diag(covariance))
+    if not (np.all(np.isfinite(sigma)) and np.all(sigma > 0.0)):
+        return 0.0
+    return float(np.clip(covariance[0, 1] / sigma.prod(), -1.0, 1.0))
 
 
 def _describe_similarity(path: DriftPath) -> str:

@@ -105,7 +105,8 @@ def test_plot_and_table_of_the_same_drift(blanked, tmp_path, capsys):
         rows = list(csv.DictReader(file))
     assert (
         ",".join(rows[0])
-        == "stamp_ns,dx_m,dy_m,sigma_x_m,sigma_y_m,dx_px,dy_px,sigma_x_px,sigma_y_px,status"
+        == "stamp_ns,dx_m,dy_m,sigma_x_m,sigma_y_m,dx_px,dy_px,sigma_x_px,sigma_y_px,status,"
+        "correlation_m,correlation_px"
     )
     assert [r["status"].split(":")[0] for r in rows].count("coasting") == 2
 

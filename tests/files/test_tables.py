@@ -42,6 +42,8 @@ def test_values_read_back_exactly(tmp_path: Path) -> None:
         0.01,
         0.02,
         "coasting: a, b",
+        0.5,
+        -0.25,
     )
     write_table(path, DRIFT_COLUMNS, [row])
     with path.open(newline="") as stream:
@@ -71,6 +73,8 @@ _ROW = (
     0.01,
     0.02,
     "coasting: a, b",
+    0.5,
+    -0.25,
 )
 
 

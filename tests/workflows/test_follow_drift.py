@@ -16,19 +16,22 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from semcal_ros.config.config import load_config
-from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
+from semcal_ros.core.drift.estimates import DriftPath, DriftPredictor, DriftUpdate
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.workflows.follow_drift import describe_beginnings, estimate_timing
+from semcal_ros.workflows.track_drift import DriftTrack
 from tests.helpers.drift_scenes import make_drift_update
 
 LOST = Rejection(MatchFailure.NO_PEAK, "lost")
@@ -123,3 +126,22 @@ def test_where_tracking_began_again_is_said_with_what_is_known_of_it() -> None:
         ),
         "tracking began again 1 more time",
     ]
+
+
+def test_the_table_says_in_which_direction_a_drift_is_known(tmp_path: Path) -> None:
+    """Known to 0.01 along (1, 1) and to 1 across; pixels run the other way along y, and are twice as many along x."""
+    covariance = np.zeros((3, 4, 4))
+    covariance[1, :2, :2] = 0.5 * np.array([[1.0001, -0.9999], [-0.9999, 1.0001]])
+    covariance[2] = np.diag(np.full(4, np.inf))
+    path = DriftPath(
+        [make_drift_update(covariance=c, px_from_unit=np.diag([2.0, -1.0])) for c in covariance]
+    )
+    predictor = cast("DriftPredictor", None)
+    DriftTrack((0, 1, 2), path, {}, predictor, load_config("generic"), ()).save(tmp_path / "d.csv")
+    with (tmp_path / "d.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    in_m, in_px = ([float(row[f"correlation_{unit}"]) for row in rows] for unit in ("m", "px"))
+    # What is exact, as the first frame, or not known at all is not correlated.
+    np.testing.assert_allclose(in_m, [0.0, -0.9999 / 1.0001, 0.0], atol=1e-12)
+    np.testing.assert_allclose(in_px, [0.0, 0.9999 / 1.0001, 0.0], atol=1e-12)
+    assert float(rows[1]["sigma_x_px"]) == pytest.approx(np.sqrt(2.0 * 1.0001))

@@ -234,13 +234,17 @@ class DriftUpdate(DriftEstimate):
         return self.px_from_unit @ self.drift_m
 
     @property
-    def sigma_px(self) -> Array:
-        """(2,) 1-sigma of :attr:`drift_px`, without that of the scale; infinite where nothing was measured."""
+    def covariance_px2(self) -> Array:
+        """(2, 2) covariance of :attr:`drift_px`, without that of the scale; infinite where nothing was measured."""
         own = self.covariance[:2, :2] - self.of_scale
         if not np.all(np.isfinite(own)):
-            return np.full(2, np.inf)
-        variance = np.diag(self.px_from_unit @ own @ self.px_from_unit.T)
-        return np.sqrt(np.maximum(variance, 0.0))
+            return np.diag([np.inf, np.inf])
+        return np.asarray(self.px_from_unit @ own @ self.px_from_unit.T)
+
+    @property
+    def sigma_px(self) -> Array:
+        """(2,) 1-sigma of :attr:`drift_px`, without that of the scale; infinite where nothing was measured."""
+        return np.sqrt(np.maximum(np.diag(self.covariance_px2), 0.0))
 
 
 @dataclass(frozen=True)
