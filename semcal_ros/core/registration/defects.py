@@ -302,10 +302,14 @@ def _compare_shifts(
     for shift in shifts:
         found = _refine(pyramid, shift, noise, shown)
         is_held = isinstance(found, Rejection) or not found.converged
-        if is_held and shown.is_all:
+        if is_held:
             # Of lines, only defects tell the place along them, which are elsewhere.
             found = align([level], pyramid, shift, held=along)
         if isinstance(found, Rejection) or not found.converged:
+            continue
+        aside_px = float(np.max(np.abs(found.shift_px - shift)))
+        if is_held and not shown.is_all and aside_px > SAME_SHIFT_PX:
+            # What is none of the lattice has pulled it.
             continue
         if any(np.max(np.abs(found.shift_px - c.shift_px)) < SAME_SHIFT_PX for c in compared):
             continue
