@@ -593,7 +593,7 @@ def _register(
         alignment = refined
     elif of_parts:
         # The rest would add noise, or pull.
-        alignment = Rejection(MatchFailure.UNDETERMINED, "too little of the specimen in common")
+        alignment = Rejection(MatchFailure.DISSIMILAR, "too little of the specimen in common")
     else:
         alignment = align(reference.levels, pyramid, np.array(peak.shift_px))
         if isinstance(alignment, Rejection) or not alignment.converged:
