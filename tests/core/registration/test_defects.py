@@ -21,7 +21,7 @@ from typing import cast
 import cv2
 import numpy as np
 import pytest
-from scipy import integrate, optimize, stats
+from scipy import integrate, optimize, special, stats
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.registration.defects import (
@@ -380,3 +380,49 @@ def test_a_lattice_in_another_focus_still_tells_its_shift() -> None:
     found = compare(first, blurred, drift, 0.5)
     assert found.accepted, found.reason
     np.testing.assert_allclose(found.shift_px, drift, atol=0.06)
+
+
+def draw_circuit(period: float, shift: Array, seed: int) -> Array:
+    """Lines of an integrated circuit, some of which end or are missing, with vias on them; in electrons for 20."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float64)
+    angle = rng.uniform(-0.05, 0.05)
+    across = (x - shift[0]) * np.cos(angle) + (y - shift[1]) * np.sin(angle)
+    along = y - shift[1]
+
+    def inside(distance: Array) -> Array:
+        return np.asarray(special.expit(-2.0 * distance))
+
+    picture = np.full((SIZE, SIZE), 0.25)
+    for k in range(-3, 16):
+        end = rng.choice([400.0, 400.0, 400.0, rng.uniform(20.0, 170.0), -400.0])
+        off = np.abs(across - period * k)
+        picture += 0.4 * inside(np.maximum(off - 0.22 * period, along - end))
+        for at in rng.uniform(-40.0, 230.0, 2):
+            via = inside(np.hypot(across - period * k, along - at) - 0.33 * period)
+            picture = np.maximum(picture, 0.25 + 0.65 * via)
+    return picture
+
+
+def test_vias_and_ends_tell_the_shift_of_lines_beside_bare_ground() -> None:
+    refused = []
+    for seed in range(8):
+        rng = np.random.default_rng(100 + seed)
+        shift, period = rng.uniform(-2.0, 2.0, 2), rng.uniform(14.0, 18.0)
+        jump = np.array([period, 30.0])
+        first, second, third = (
+            np.clip(8.0 * rng.poisson(20.0 * draw_circuit(period, at, seed)), 0.0, 255.0)
+            for at in (np.zeros(2), shift, shift + jump)
+        )
+        found = register_pair(first, second)
+        if not found.accepted:
+            refused.append(found.reason)
+            continue
+        sigma = np.sqrt(np.diag(found.covariance))
+        assert np.all(np.abs(found.shift_px - shift) < 4.0 * sigma)
+        assert np.max(sigma) < 0.15
+        # A prediction hides no jump by a period.
+        after = register_pair(first, third, guess_px=shift, guess_covariance=0.25 * np.eye(2))
+        assert not after.accepted or np.max(np.abs(after.shift_px - shift - jump)) < 0.6
+    # Where only a few vias are in sight, it may be.
+    assert len(refused) <= 1, refused

@@ -20,6 +20,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy import special
 
 from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.drift.tracker import DriftTracker
@@ -76,7 +77,7 @@ def _discs(places: np.ndarray, rng: np.random.Generator, electrons: float = 60.0
     signal = np.zeros((192, 192))
     for place in places:
         # An edge of 1 px.
-        signal += 1.0 / (1.0 + np.exp((np.hypot(x - place[0], y - place[1]) - 2.0) / 0.5))
+        signal += special.expit(-2.0 * (np.hypot(x - place[0], y - place[1]) - 2.0))
     grey = rng.poisson(electrons * signal + 0.3) * (180.0 / electrons)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
@@ -135,3 +136,21 @@ def test_what_noise_does_where_the_gradients_are(everywhere: bool) -> None:
         # At the edge of where the noise is, the smoothing takes some.
         assert np.mean(found) == pytest.approx(0.85 * expected, rel=0.2)
         assert np.mean(plain) < 0.7 * np.mean(found)
+
+
+@pytest.mark.parametrize("jump", [(60.0, -44.0), (90.0, -60.0)])
+@pytest.mark.parametrize("seed", range(2))
+def test_where_a_stage_has_taken_particles_away_from_under_a_tool_is_in_the_sigma(
+    seed: int, jump: tuple[float, float]
+) -> None:
+    """The tool is left out, and of what was in sight too little is left: any other place may be in sight."""
+    rng = np.random.default_rng(seed)
+    places, tracker = rng.uniform(-90.0, 282.0, (40, 2)), DriftTracker()
+    tool = np.array([[40.0, 90.0], [40.0, 99.0], [40.0, 108.0]])
+    for k in range(12):
+        drift = k * np.array([0.1, 0.15]) + (np.array(jump) if k > 9 else 0.0)
+        image = _discs(np.vstack([places + drift, tool + [3.0 * k, 0.0]]), rng)
+        update = tracker.update(image, float(k))
+        assert update.accepted == (k <= 9)
+        error = np.abs(update.drift_px - drift)
+        assert np.all(error < 4.0 * update.sigma_px + 1e-9)
