@@ -25,9 +25,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES
-from semcal_ros.core.calibration.estimator.bundle_adjustment import (
-    variance_factor,
-)
+from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_factor
 from semcal_ros.core.calibration.estimator.posterior import CovarianceParts, certify
 from semcal_ros.core.calibration.estimator.problem import Functions, Setup
 from semcal_ros.core.calibration.estimator.residual_field_fit import FittedField
