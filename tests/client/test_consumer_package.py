@@ -102,16 +102,28 @@ def test_it_installs_where_ros_looks_for_it(package: Installed) -> None:
     assert (package.prefix / "lib/bead_tracker/bead").is_file()
 
 
+def set_parameters(*parameters: str) -> list[str]:
+    return ["--ros-args", *(word for text in parameters for word in ("-p", text))]
+
+
 def node(name: str, *parameters: str) -> list[str]:
-    given = [word for text in parameters for word in ("-p", text)]
-    return [sys.executable, "-m", f"semcal_ros.nodes.{name}", "--ros-args", *given]
+    return [sys.executable, "-m", f"semcal_ros.nodes.{name}", *set_parameters(*parameters)]
+
+
+# No frame is corrected by a forecast, so that the path is the same however busy the computer is.
+ALL_MEASURED = "drift_tracking:=every_frame"
+
+
+def wait_in(topic: str, end: str = "subscription") -> str:
+    """Let all frames of the sweep wait: with the usual ten, a busy computer skips late ones, as it should."""
+    return f"qos_overrides./sem/{topic}.{end}.depth:=40"
 
 
 @pytest.mark.long
 def test_the_path_in_the_process_of_the_suite_by_python(package: Installed, sweep: Path) -> None:
     given = ("source:=bag", "viewer:=false", f"bag:={sweep / 'sweep'}", "consumer_depth:=40")
     command = node("suite", "config:=virtual_sem", f"calibration:={sweep / 'cal.yaml'}", *given)
-    command += ["-p", "qos_overrides./sem/image_raw.subscription.depth:=40"]
+    command += ["-p", wait_in("image_raw"), "-p", ALL_MEASURED]
     done = subprocess.run(
         command,
         env=package.environment(),
@@ -127,15 +139,18 @@ def test_the_path_in_the_process_of_the_suite_by_python(package: Installed, swee
 @pytest.mark.long
 def test_the_path_in_a_process_of_its_own_by_python(package: Installed, sweep: Path) -> None:
     environment = package.environment()
-    corrector = node("stream_corrector", "config:=virtual_sem", f"calibration:={sweep}/cal.yaml")
+    waiting = (wait_in("image_raw"), wait_in("image_rect", "publisher"))
+    given = ("config:=virtual_sem", f"calibration:={sweep}/cal.yaml", *waiting, ALL_MEASURED)
+    corrector = node("stream_corrector", *given)
     player = node(
         "bag_player",
         f"bag:={sweep / 'sweep'}",
         "wait_for_subscribers:=2",
         f"wait_for:='{HEARD}'",
     )
+    tracker = package.prefix / "lib/bead_tracker/bead"
     own = subprocess.Popen(
-        [sys.executable, "-u", package.prefix / "lib/bead_tracker/bead"],
+        [sys.executable, "-u", tracker, *set_parameters(wait_in("image_rect"))],
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
