@@ -28,7 +28,11 @@ from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.thresholds import (
     OVERLAY_CLIPPED_MIN,
     OVERLAY_ENLARGED_PX,
+    OVERLAY_EXPECTED_MIN,
     OVERLAY_FILLED_PX,
+    OVERLAY_LETTER_PIXELS_MIN,
+    OVERLAY_LETTER_PX_MAX,
+    OVERLAY_LETTERS_MAX,
     OVERLAY_LINE_PX,
     OVERLAY_NEAR_MIN,
     OVERLAY_NOISE_MIN,
@@ -41,6 +45,7 @@ from semcal_ros.core.drift.thresholds import (
     OVERLAY_STEADY_MAX,
     OVERLAY_STEP_SIGMAS,
     OVERLAY_TEXT_PX,
+    OVERLAY_UNCHANGED_SIGMAS,
 )
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 
@@ -58,7 +63,8 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
 
     Only pictures of integers tell: floats were computed, and may have lost their noise. It fails on pictures almost
     without noise, and says then that there is none. Of what is drawn in the largest or the least grey level, to which
-    a specimen may be clipped, straight lines are found, and shapes whose border noise does not move.
+    a specimen may be clipped, what has straight and sharp edges is found, and shapes whose border noise does not move.
+    Letters that change are found beside others of their grey level.
     """
     if before.shape != now.shape or before.dtype.kind not in "iu" or now.dtype.kind not in "iu":
         return None
@@ -74,8 +80,10 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     levels = now.min(), now.max()
     drawn = same & ((now == levels[0]) | (now == levels[1]))
     core = np.zeros_like(same)
-    for level in levels:
-        core |= _find_steady_shapes(before, now, int(level), noise)
+    for level in map(int, levels):
+        core |= _find_steady_shapes(before, now, level, noise)
+        core |= _find_straight_lines(before, now, level, noise)
+        core |= _find_straight_lines(before.T, now.T, level, noise).T
     same &= ~drawn
     rate = float(same.mean())
     counted = same.astype(np.uint8)
@@ -84,12 +92,24 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
         expected = pixels * rate + OVERLAY_SIGMAS * np.sqrt(pixels * rate * (1.0 - rate))
         near = cv2.boxFilter(counted, cv2.CV_16U, window, normalize=False)
         core |= same & (near >= max(expected, OVERLAY_NEAR_MIN))
-        if 1 in window and np.any(drawn):
-            line = cv2.boxFilter(drawn.astype(np.uint8), cv2.CV_16U, window, normalize=False)
-            core |= drawn & (line >= OVERLAY_CLIPPED_MIN)
     if np.count_nonzero(core) < OVERLAY_PIXELS_MIN:
         return None
-    return grow_mask(core, OVERLAY_ENLARGED_PX)
+    return grow_mask(core | _find_changing_letters(before, now, core), OVERLAY_ENLARGED_PX)
+
+
+def keep_overlay(known: Mask, before: AnyImage, now: AnyImage) -> Mask:
+    """(h, w) what is still drawn of a ``known`` overlay: its parts of which more is the same in two pictures than of
+    the rest. A part of which one look is not sure is no part that has gone.
+    """
+    if known.shape != now.shape[:2] or before.shape != now.shape:
+        return np.zeros(now.shape[:2], dtype=bool)
+    same = before == now if now.ndim == 2 else before[..., 1] == now[..., 1]
+    rate = float(same[~known].mean()) if not np.all(known) else 0.0
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8))
+    pixels = boxes[:, cv2.CC_STAT_AREA]
+    alike = np.bincount(labels.ravel(), same.ravel(), len(pixels))
+    stays = alike >= pixels * rate + OVERLAY_SIGMAS * np.sqrt(pixels * rate * (1.0 - rate))
+    return np.asarray(known & stays[labels])
 
 
 def _box_around(mask: Mask, margin_px: int) -> tuple[slice, slice]:
@@ -108,7 +128,7 @@ def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: floa
     picture by the noise over the slope. The edge of a beam falls the faster, in its logarithm, the farther out it is,
     so that what is left of the step beside the border limits the slope. A shape that is drawn has the same pixels, and
     nothing is left of the step beside them; or what is left was mixed with the picture, and has less noise than that.
-    This is asked of all shapes together, of those that are near each other, and of each.
+    This is asked of all shapes together, of those that are near each other, of each, and of all that do not change.
     """
     whole = (before == level) & (now == level)
     if not np.any(whole):
@@ -145,8 +165,11 @@ def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: floa
         sum_up(labels[border]),
         sum_up(near[in_any & ~in_both]),
     ]
-    steady = np.zeros(count, bool)
-    for group in (np.minimum(groups, 1), groups, np.arange(count)):
+
+    def judge(group: NDArray[np.int32]) -> tuple[Mask, Mask, Array]:
+        """Of the shapes of each group together: whether they are no noise, whether they are steady, and how many pixels
+        of their border noise should change.
+        """
         sums = [np.bincount(group[1:], one[1:], count)[group] for one in of_shapes]
         size, farther_size = np.maximum(sums[0], 1.0), np.maximum(sums[3], 1.0)
         is_high = sums[4] > OVERLAY_STEP_SIGMAS * noise * farther_size
@@ -157,16 +180,90 @@ def _find_steady_shapes(before: AnyImage, now: AnyImage, level: int, noise: floa
         # The first pixels are half a pixel from the border on average.
         slope = -step * np.log(left) / 0.5
         # The mean difference of two normal deviates is 2 / sqrt(pi) of their sigma.
-        expected = 2.0 / np.sqrt(np.pi) * noise * sums[6] / slope
-        is_steady = sums[7] <= OVERLAY_STEADY_MAX * expected
+        expected: Array = 2.0 / np.sqrt(np.pi) * noise * sums[6] / slope
+        is_steady = is_high & (sums[7] <= OVERLAY_STEADY_MAX * expected)
         # The mean size of a normal deviate is known to 0.76 of itself over the root of their number.
         chance = 0.76 * np.sqrt(1.0 / size + 1.0 / farther_size)
         quietest = np.minimum(OVERLAY_QUIET_MAX, 1.0 - OVERLAY_QUIET_SIGMAS * chance)
         is_quiet = sums[2] / size < quietest * sums[5] / farther_size
-        steady |= is_high & is_steady & (is_quiet | (left <= OVERLAY_SHARP_MAX))
+        return is_high, is_steady & (is_quiet | (left <= OVERLAY_SHARP_MAX)), expected
+
+    alone, steady, expected = judge(np.arange(count, dtype=np.int32))
+    steady = steady | judge(np.minimum(groups, 1))[1] | judge(groups)[1]
+    # Digits that change beside others must not speak for them: those without any change count together, if more of the
+    # border has none than chance leaves.
+    expected = np.where(alone, expected, 0.0)
+    unchanged = alone & (of_shapes[7] == 0) & (expected >= OVERLAY_EXPECTED_MIN)
+    by_chance = np.exp(-expected)
+    excess = float(expected[unchanged].sum() - (expected * by_chance).sum())
+    variance = float((expected**2 * by_chance * (1.0 - by_chance)).sum())
+    if excess > OVERLAY_UNCHANGED_SIGMAS * np.sqrt(variance):
+        steady |= unchanged & judge(np.where(unchanged, 1, 0).astype(np.int32))[1]
     steady[0] = False
     found = np.zeros_like(whole)
     found[cut] = steady[labels]
+    return found
+
+
+def _find_straight_lines(before: AnyImage, now: AnyImage, level: int, noise: float) -> Mask:
+    """(h, w) True in what is drawn along rows in one extreme grey level: lines, and the ground of a data bar.
+
+    What a specimen has that is clipped to the level may be as large; but its border is not straight, or noise moves it,
+    or something is left of its edge one pixel beside it.
+    """
+    both, either = (before == level) & (now == level), (before == level) | (now == level)
+    size, border = (OVERLAY_LINE_PX, 1), cv2.BORDER_CONSTANT
+
+    def count_along(mask: Mask) -> NDArray[np.int32]:
+        found = cv2.boxFilter(
+            mask.astype(np.uint8), cv2.CV_16U, size, normalize=False, borderType=border
+        )
+        return np.asarray(found, dtype=np.int32)
+
+    runs = both & (count_along(both) >= OVERLAY_CLIPPED_MIN)
+    if not np.any(runs):
+        return runs
+    beside = count_along(either) <= OVERLAY_LINE_PX - OVERLAY_CLIPPED_MIN
+    step = np.abs(0.5 * (before.astype(np.float32) + now.astype(np.float32)) - level)
+    step = cv2.boxFilter(step, cv2.CV_32F, size, borderType=cv2.BORDER_REPLICATE)
+    allowed = OVERLAY_SIGMAS * noise / np.sqrt(OVERLAY_LINE_PX)
+    edges = np.zeros_like(runs)
+    for turn in (slice(None), slice(None, None, -1)):
+        # Of a row, the next two after it.
+        first, second = step[turn][1:-1], step[turn][2:]
+        is_sharp = first >= (1.0 - OVERLAY_SHARP_MAX) * second - allowed
+        edges[turn][:-2] |= runs[turn][:-2] & beside[turn][1:-1] & is_sharp
+    _, labels = cv2.connectedComponents(runs.astype(np.uint8), connectivity=8)
+    return runs & np.isin(labels, np.unique(labels[edges]))
+
+
+def _find_changing_letters(before: AnyImage, now: AnyImage, core: Mask) -> Mask:
+    """(h, w) True in letters that are there in one of two pictures only, or are others in the next ones, such as those
+    of a counter: they have the grey level of those that are the same in both, the ``core``, and lie beside them.
+    """
+    found = np.zeros_like(core)
+    levels, counts = np.unique(now[core], return_counts=True)
+    for level in levels[counts >= OVERLAY_PIXELS_MIN].tolist():
+        either = (before == level) | (now == level)
+        if float(np.mean(either & ~core)) > OVERLAY_LETTERS_MAX:
+            # The specimen has this level, too.
+            continue
+        _, labels, boxes, _ = cv2.connectedComponentsWithStats(either.astype(np.uint8))
+        sides, areas = (
+            boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1],
+            boxes[:, cv2.CC_STAT_AREA],
+        )
+        is_letter = (sides.max(axis=1) <= OVERLAY_LETTER_PX_MAX) & (
+            areas >= OVERLAY_LETTER_PIXELS_MIN
+        )
+        is_letter[0] = False
+        letters = is_letter[labels]
+        near = cv2.dilate((letters | (core & either)).astype(np.uint8), _NEARBY)
+        _, lines = cv2.connectedComponents(near)
+        letters &= np.isin(lines, np.unique(lines[core & either]))
+        for k in np.unique(labels[letters]).tolist():
+            x, y, width, height = boxes[k, : cv2.CC_STAT_AREA].tolist()
+            found[y : y + height, x : x + width] = True
     return found
 
 

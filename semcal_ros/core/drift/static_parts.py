@@ -31,7 +31,7 @@ from semcal_ros.core.drift.fixed_parts import (
     to_levels,
 )
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.overlay import find_overlay, keep_overlay, remove_overlay
 from semcal_ros.core.drift.stripes import Stripes, find_stripes, suspect_stripes
 from semcal_ros.core.drift.thresholds import (
     FIXED_EVERY_FRAMES_MAX,
@@ -123,6 +123,10 @@ class StaticParts:
         if not looks or self.before is None or np.array_equal(self.before, image):
             return parts, False
         found = find_overlay(self.before, image)
+        if self.overlay is not None:
+            kept = keep_overlay(self.overlay, self.before, image)
+            if np.any(kept):
+                found = kept if found is None else kept | found
         return replace(parts, overlay=found), found is not None and self.overlay is None
 
     def keep(self, image: AnyImage) -> StaticParts:

@@ -444,6 +444,16 @@ OVERLAY_STEADY_MAX = TABLE.stated(
     "Pixels of the border of a shape in an extreme grey level that change from picture to picture. Of particles of up "
     "to eight times the range as many change as are expected.",
 )
+OVERLAY_EXPECTED_MIN = TABLE.derived(
+    "OVERLAY_EXPECTED_MIN", 1.0, "px",
+    "That noise should change of the border of a shape where that none does says something: by chance, none does in "
+    "exp(-1) = 37 of 100.",
+)
+OVERLAY_UNCHANGED_SIGMAS = TABLE.derived(
+    "OVERLAY_UNCHANGED_SIGMAS", 3.0, "sigma",
+    "By which shapes without any change have more of the border than chance leaves: once in 740, and what lies beside "
+    "them must be quiet as well, or sharp.",
+)
 OVERLAY_QUIET_MAX = TABLE.stated(
     "OVERLAY_QUIET_MAX", 0.75, "of the noise",
     "That is left beside a shape whose edge is mixed with the picture, half of it on average. Beside a clipped part of "
@@ -458,9 +468,9 @@ OVERLAY_SHARP_MAX = TABLE.derived(
     "That is left one pixel beside a shape. A Gaussian edge of 0.7 px leaves as much where it is clipped at a "
     "twentieth of its height, and one of 0.5 px at a third.",
 )
-OVERLAY_STEP_SIGMAS = TABLE.stated(
-    "OVERLAY_STEP_SIGMAS", 5.0, "sigma of the noise",
-    "That a shape differs from what lies around it: noise that is clipped makes shapes, too.",
+OVERLAY_STEP_SIGMAS = TABLE.derived(
+    "OVERLAY_STEP_SIGMAS", 4.0, "sigma of the noise",
+    "That a shape differs from what lies around it: noise that is clipped makes shapes, too, of a pixel in 30 000.",
 )
 OVERLAY_NOISE_MIN = TABLE.derived(
     "OVERLAY_NOISE_MIN", 1.5, "grey levels",
@@ -472,6 +482,20 @@ OVERLAY_SAME_MAX = TABLE.measured(
     "That may be the same: more is a picture that came again. 1.5 times as large or as small, it changes nothing in "
     "25 cases; a thousand times or a thousandth of it does.",
     command=TRIED,
+)
+OVERLAY_LETTERS_MAX = TABLE.stated(
+    "OVERLAY_LETTERS_MAX", 0.01, "of the image",
+    "That has the grey level of letters besides them: of a specimen with more of it, noise makes shapes as large as "
+    "letters.",
+)
+OVERLAY_LETTER_PX_MAX = TABLE.stated(
+    "OVERLAY_LETTER_PX_MAX", 36, "px",
+    "Of a letter along its longer side, four times OVERLAY_TEXT_PX: its box is left out as a whole, so that a circle "
+    "or a frame is none.",
+)
+OVERLAY_LETTER_PIXELS_MIN = TABLE.stated(
+    "OVERLAY_LETTER_PIXELS_MIN", 6, "px",
+    "Of a letter: the least that is legible, five of height and one more. Fewer that touch may be noise.",
 )
 OVERLAY_ENLARGED_PX = TABLE.measured(
     "OVERLAY_ENLARGED_PX", 2, "px",

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.overlay import find_overlay, keep_overlay, remove_overlay
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.drift_scenes import Texture
 
@@ -133,3 +133,68 @@ def test_clipped_particles_at_rest_are_not_drawn(peak: float, noise: float) -> N
     for seed in range(6):
         pair = [particles((0.0, 0.0), 2 * seed + k, peak=peak, noise=noise) for k in (0, 1)]
         assert find_overlay(*pair) is None
+
+
+@pytest.mark.parametrize("radius", [16.0, 40.0])
+@pytest.mark.parametrize("noise", [2.0, 12.0])
+def test_a_large_clipped_particle_has_no_straight_edges(radius: float, noise: float) -> None:
+    """Many of its rows are white over more than the length of a line that is drawn."""
+    for seed in range(6):
+        pair = []
+        for k in (0, 1):
+            picture = particles((0.0, 0.0), 2 * seed + k, peak=100.0, noise=noise).astype(float)
+            y, x = np.mgrid[0.0:SIZE, 0.0:SIZE] - 110.3
+            picture += 400.0 * ndtr((radius - np.hypot(x, y)) / 0.8)
+            pair.append(np.rint(picture).clip(0, 255).astype(np.uint8))
+        assert np.count_nonzero((pair[0] == 255) & (pair[1] == 255)) > 500
+        assert find_overlay(*pair) is None
+
+
+def count_in_white(image: np.ndarray, number: int) -> np.ndarray:
+    """The picture with a counter of five digits, of which the last one changes from picture to picture."""
+    text = np.zeros_like(image)
+    cv2.putText(text, f"{number:05d}", (10, SIZE - 10), cv2.FONT_HERSHEY_PLAIN, 1.4, 255, 2)
+    share = text / 255.0
+    return np.rint(image * (1.0 - share) + 255.0 * share).astype(np.uint8)
+
+
+def few_particles(shift: tuple[float, float], seed: int, noise: float) -> np.ndarray:
+    """Some of the particles, fainter than the digits of a counter."""
+    return particles(shift, seed, peak=90.0, noise=noise, blur_px=1.0)
+
+
+@pytest.mark.parametrize("noise", [10.0, 25.0])
+def test_the_digits_of_a_counter_that_change_are_found_as_well(noise: float) -> None:
+    first, second = (few_particles((0.3 * k, 0.0), k, noise) for k in (0, 1))
+    found = find_overlay(count_in_white(first, 7041), count_in_white(second, 7042))
+    assert found is not None
+    for number in range(7040, 7050):
+        drawn = count_in_white(first, number) != first
+        # Softened edges beyond the box of those that were seen are faint.
+        assert found[drawn].mean() > 0.97
+    assert found.mean() < 0.05
+    assert find_overlay(first, second) is None
+
+
+@pytest.mark.parametrize("noise", [10.0, 25.0])
+def test_a_drift_of_few_particles_is_not_held_by_a_counter(noise: float) -> None:
+    tracker = DriftTracker()
+    for k in range(16):
+        shift = (0.25 * k, -0.2 * k)
+        seen = count_in_white(few_particles(shift, k, noise), 7025 + k)
+        update = tracker.update(seen, float(k))
+        assert update.accepted, update.reason
+        error = np.abs(update.drift_px - shift)
+        assert np.all(error < np.maximum(4.0 * np.sqrt(np.diag(update.covariance)[:2]), 0.1))
+        assert np.all(error < 0.6)
+
+
+def test_what_is_drawn_is_kept_while_it_is_there() -> None:
+    """A look that is not sure does not forget it, and one at pictures without it does."""
+    first, second = (count_in_white(few_particles((0.0, 0.0), k, 10.0), 7041) for k in (0, 1))
+    known = find_overlay(first, second)
+    assert known is not None
+    np.testing.assert_array_equal(keep_overlay(known, first, second), known)
+    plain = [few_particles((0.0, 0.0), k, 10.0) for k in (2, 3)]
+    assert not np.any(keep_overlay(known, *plain))
+    assert not np.any(keep_overlay(known, first[:-2], second[:-2]))
