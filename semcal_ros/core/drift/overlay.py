@@ -97,21 +97,6 @@ def find_overlay(before: AnyImage, now: AnyImage) -> Mask | None:
     return grow_mask(core | _find_changing_letters(before, now, core), OVERLAY_ENLARGED_PX)
 
 
-def keep_overlay(known: Mask, before: AnyImage, now: AnyImage) -> Mask:
-    """(h, w) what is still drawn of a ``known`` overlay: its parts of which more is the same in two pictures than of
-    the rest. A part of which one look is not sure is no part that has gone.
-    """
-    if known.shape != now.shape[:2] or before.shape != now.shape:
-        return np.zeros(now.shape[:2], dtype=bool)
-    same = before == now if now.ndim == 2 else before[..., 1] == now[..., 1]
-    rate = float(same[~known].mean()) if not np.all(known) else 0.0
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8))
-    pixels = boxes[:, cv2.CC_STAT_AREA]
-    alike = np.bincount(labels.ravel(), same.ravel(), len(pixels))
-    stays = alike >= pixels * rate + OVERLAY_SIGMAS * np.sqrt(pixels * rate * (1.0 - rate))
-    return np.asarray(known & stays[labels])
-
-
 def _box_around(mask: Mask, margin_px: int) -> tuple[slice, slice]:
     """The rows and columns of a mask (h, w) with anything in it, and ``margin_px`` more to each side."""
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
@@ -226,7 +211,7 @@ def _find_straight_lines(before: AnyImage, now: AnyImage, level: int, noise: flo
     beside = count_along(either) <= OVERLAY_LINE_PX - OVERLAY_CLIPPED_MIN
     step = np.abs(0.5 * (before.astype(np.float32) + now.astype(np.float32)) - level)
     step = cv2.boxFilter(step, cv2.CV_32F, size, borderType=cv2.BORDER_REPLICATE)
-    allowed = OVERLAY_SIGMAS * noise / np.sqrt(OVERLAY_LINE_PX)
+    allowed = OVERLAY_UNCHANGED_SIGMAS * noise / np.sqrt(OVERLAY_LINE_PX)
     edges = np.zeros_like(runs)
     for turn in (slice(None), slice(None, None, -1)):
         # Of a row, the next two after it.

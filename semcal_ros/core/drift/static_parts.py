@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import AnyImage, Array, Mask
 from semcal_ros.core.drift.fixed_parts import (
@@ -31,7 +32,7 @@ from semcal_ros.core.drift.fixed_parts import (
     to_levels,
 )
 from semcal_ros.core.drift.frame import ScanFrame
-from semcal_ros.core.drift.overlay import find_overlay, keep_overlay, remove_overlay
+from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
 from semcal_ros.core.drift.stripes import Stripes, find_stripes, suspect_stripes
 from semcal_ros.core.drift.thresholds import (
     FIXED_EVERY_FRAMES_MAX,
@@ -40,6 +41,7 @@ from semcal_ros.core.drift.thresholds import (
     NEWLY_FIXED,
     OVERLAY_EVERY_FRAMES,
     OVERLAY_FIRST_FRAMES,
+    OVERLAY_LOOKS_KEPT,
     STRIPE_MOVE_PX_MAX,
 )
 from semcal_ros.core.registration.agreement import MovingTiles
@@ -73,8 +75,8 @@ class StaticParts:
         Number of frames since the first.
     before
         The last frame as it came, where the next one is compared with it.
-    overlay
-        (h, w) what is drawn into all frames; None where nothing was found.
+    drawn
+        (h, w) for how many more looks a pixel is taken for drawn into all frames; None where none is.
     fixed
         (h, w) what else stays in place; None where nothing was found.
     earlier
@@ -90,12 +92,17 @@ class StaticParts:
 
     frames: int = 0
     before: AnyImage | None = None
-    overlay: Mask | None = None
+    drawn: NDArray[np.uint8] | None = None
     fixed: Mask | None = None
     earlier: EarlierFrame | None = None
     comparisons: int = 0
     stripes: Stripes = field(default_factory=Stripes)
     anchor: EarlierFrame | None = None
+
+    @property
+    def overlay(self) -> Mask | None:
+        """(h, w) what is drawn into all frames; None where nothing was found."""
+        return None if self.drawn is None else self.drawn > 0
 
     def remove_from(self, frame: ScanFrame) -> ScanFrame:
         """The frame with the place of what does not show the specimen filled from around, as far as it is known, and
@@ -122,12 +129,15 @@ class StaticParts:
         looks = frames <= OVERLAY_FIRST_FRAMES or frames % OVERLAY_EVERY_FRAMES == 0
         if not looks or self.before is None or np.array_equal(self.before, image):
             return parts, False
-        found = find_overlay(self.before, image)
-        if self.overlay is not None:
-            kept = keep_overlay(self.overlay, self.before, image)
-            if np.any(kept):
-                found = kept if found is None else kept | found
-        return replace(parts, overlay=found), found is not None and self.overlay is None
+        found, known = find_overlay(self.before, image), self.drawn
+        drawn = np.zeros(image.shape[:2], dtype=np.uint8)
+        if known is not None and known.shape == drawn.shape:
+            # A part of which one look is not sure has not gone.
+            drawn = np.maximum(known, 1) - np.uint8(1)
+        if found is not None:
+            drawn[found] = OVERLAY_LOOKS_KEPT
+        is_new = found is not None and self.overlay is None
+        return replace(parts, drawn=drawn if np.any(drawn) else None), is_new
 
     def keep(self, image: AnyImage) -> StaticParts:
         """Keep a frame as it came, where the next one is compared with it."""

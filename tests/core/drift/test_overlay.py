@@ -21,7 +21,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from semcal_ros.core.drift.overlay import find_overlay, keep_overlay, remove_overlay
+from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
+from semcal_ros.core.drift.static_parts import StaticParts
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.drift_scenes import Texture
 
@@ -189,12 +190,20 @@ def test_a_drift_of_few_particles_is_not_held_by_a_counter(noise: float) -> None
         assert np.all(error < 0.6)
 
 
-def test_what_is_drawn_is_kept_while_it_is_there() -> None:
-    """A look that is not sure does not forget it, and one at pictures without it does."""
-    first, second = (count_in_white(few_particles((0.0, 0.0), k, 10.0), 7041) for k in (0, 1))
-    known = find_overlay(first, second)
-    assert known is not None
-    np.testing.assert_array_equal(keep_overlay(known, first, second), known)
-    plain = [few_particles((0.0, 0.0), k, 10.0) for k in (2, 3)]
-    assert not np.any(keep_overlay(known, *plain))
-    assert not np.any(keep_overlay(known, first[:-2], second[:-2]))
+def test_what_is_drawn_is_kept_for_some_looks() -> None:
+    """A look that is not sure does not forget it; what is there no more is forgotten."""
+    parts, masks = StaticParts(), []
+    for k in range(40):
+        frame = few_particles((0.0, 0.0), k, 10.0)
+        if k < 3:
+            frame = count_in_white(frame, 7041)
+        parts, _ = parts.look_for_overlay(frame)
+        parts = parts.keep(frame)
+        masks.append(parts.overlay)
+    assert masks[0] is None
+    first = masks[1]
+    assert first is not None
+    for later in masks[2:16]:
+        assert later is not None
+        assert np.all(later[first])
+    assert masks[-1] is None
