@@ -261,8 +261,9 @@ class DriftFilter:
             if not isinstance(event, Measure) or event.key != measure.key:
                 return event
             part = min(float(np.hypot(*event.shift[:2])) / reach, 1.0) if reach > 0.0 else 1.0
-            lacks = count * (part * size) ** 2 - float(along @ event.covariance[:2, :2] @ along)
-            return event.widened(lacks * np.outer(along, along)) if lacks > 0.0 else event
+            squared, outer = (part * size) ** 2, np.outer(along, along)
+            lacks = count * squared - float(along @ event.covariance[:2, :2] @ along)
+            return event.widened(lacks * outer, squared * outer) if lacks > 0.0 else event
 
         events = tuple(widened(event) for event in self.log)
         if all(new is old for new, old in zip(events, self.log, strict=True)):

@@ -26,7 +26,7 @@ from semcal_ros.core.drift.camera_uncertainty import scale_covariance
 from semcal_ros.core.drift.estimates import DriftPath, DriftUpdate
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.similarity import SimilarityEstimate, SimilarityState, turn_drift
-from semcal_ros.core.drift.smoother import estimate_process_noise, smooth
+from semcal_ros.core.drift.smoother import estimate_process_noise, separate_common, smooth
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import INNOVATION_CHI2_MAX
 from semcal_ros.core.errors import InvalidValueError
@@ -89,11 +89,10 @@ class DriftHistory:
                 updates.extend(stretch.updates)
                 continue
             process_noise = drift_filter.process_noise
+            events, common = separate_common(drift_filter.events)
             if process_noise.psd > 0.0:
-                process_noise = estimate_process_noise(
-                    drift_filter.start, drift_filter.events, process_noise
-                )
-            states = smooth(drift_filter.start, drift_filter.events, process_noise)
+                process_noise = estimate_process_noise(drift_filter.start, events, process_noise)
+            states = smooth(drift_filter.start, events, process_noise)
             turns, first_s = similarity.smooth(), drift_filter.start.time_s
             doubts = _find_doubts(stretch.updates)
             for k, (update, state, turn) in enumerate(
@@ -108,7 +107,7 @@ class DriftHistory:
                 if _contradicts(update, smoothed):
                     updates.append(update)
                     continue
-                smoothed.covariance[:2, :2] += update.unseen + doubts[k]
+                smoothed.covariance[:2, :2] += update.unseen + doubts[k] + common[k]
                 if update.time_s > first_s:
                     smoothed.covariance[:2, :2] += process_noise.flicker_covariance
                 updates.append(smoothed)

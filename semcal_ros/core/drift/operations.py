@@ -280,6 +280,10 @@ class Measure:
         Time that the frame took.
     zoom
         (2, 2) Z of :mod:`semcal_ros.core.drift.state`.
+    independent, common
+        What of the covariance differs from frame to frame, as large as that, or None where all of it does; and (2, 2)
+        the covariance of what pulls the shift of this frame and those of others alike. A filter that knows nothing of
+        such a pull takes ``covariance``, which may be larger than both.
 
     Raises
     ------
@@ -294,6 +298,8 @@ class Measure:
     acceleration_term_s2: float = 0.0
     scan_s: float = 0.0
     zoom: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    independent: Array | None = None
+    common: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     def __post_init__(self) -> None:
         # Here and not with each use: the likelihood of a process noise applies all measurements once more.
@@ -309,15 +315,30 @@ class Measure:
                 expected="finite numbers and a positive definite covariance",
             )
 
-    def widened(self, covariance: Array) -> Measure:
+    def widened(self, covariance: Array, common: Array | None = None) -> Measure:
         """The same with a covariance (2, 2) added to that of the shift, and to that of the shear as if it had grown by
-        as much in the time of a scan.
+        as much in the time of a scan. Where ``common`` (2, 2) is told, it is that of a pull of other frames, too.
         """
-        wider = self.covariance.copy()
+        wider = replace(self, covariance=self._add(self.covariance, covariance))
+        if common is not None:
+            independent = self.covariance if self.independent is None else self.independent
+            return replace(wider, independent=independent, common=self.common + common)
+        if self.independent is None:
+            return wider
+        return replace(wider, independent=self._add(self.independent, covariance))
+
+    def _add(self, known: Array, covariance: Array) -> Array:
+        wider = known.copy()
         wider[:2, :2] += covariance
         if self.shift.size > 2 and self.scan_s > 0.0:
             wider[2:, 2:] += covariance / self.scan_s**2
-        return replace(self, covariance=wider)
+        return wider
+
+    def without_common(self) -> Measure:
+        """The measurement with the covariance of what differs from frame to frame alone."""
+        if self.independent is None:
+            return self
+        return replace(self, covariance=self.independent, independent=None, common=np.zeros((2, 2)))
 
     def jacobian(self, state: DriftState) -> Array:
         """(2 or 4, n) derivative of the measurement with respect to the state."""
@@ -368,7 +389,13 @@ class Measure:
 
     def without_shear(self) -> Measure:
         """The measurement without its shear."""
-        return replace(self, shift=self.shift[:2], covariance=self.covariance[:2, :2])
+        independent = None if self.independent is None else self.independent[:2, :2]
+        return replace(
+            self,
+            shift=self.shift[:2],
+            covariance=self.covariance[:2, :2],
+            independent=independent,
+        )
 
 
 def _mahalanobis_square(vector: Array, covariance: Array) -> float:

@@ -34,7 +34,13 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from semcal_ros.core.arrays import Array, invert_scaled
-from semcal_ros.core.drift.operations import Measure, MeasureOutcome, Operation
+from semcal_ros.core.drift.operations import (
+    AddKeyframe,
+    CloneKeyframe,
+    Measure,
+    MeasureOutcome,
+    Operation,
+)
 from semcal_ros.core.drift.process_noise import ProcessNoise
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import (
@@ -120,6 +126,35 @@ def replay(start: DriftState, events: Sequence[Event], process_noise: ProcessNoi
     for after, _ in _apply(start, events, process_noise):
         state = after
     return state
+
+
+def separate_common(events: Sequence[Event]) -> tuple[list[Event], list[Array]]:
+    """Separate what pulls the measurements of a filter alike from what differs between them.
+
+    No mean of frames makes a pull smaller, and it says nothing of how the drift changes: as a part of the noise of each
+    frame it would make all of them worth next to nothing, and the path a straight line.
+
+    Returns
+    -------
+    The events with the covariances of what differs, and (2, 2) the covariance of the pull at each mark: that of the
+    latest measurement, and of those by which its keyframe came to its place.
+    """
+    separated: list[Event] = []
+    at_marks: list[Array] = []
+    latest, of_keyframes = np.zeros((2, 2)), dict[int, Array]()
+    for event in events:
+        if isinstance(event, Measure):
+            latest = event.common + of_keyframes.get(event.key, 0.0)
+            separated.append(event.without_common())
+            continue
+        if isinstance(event, AddKeyframe):
+            of_keyframes[event.key] = latest
+        elif isinstance(event, CloneKeyframe):
+            of_keyframes[event.key] = of_keyframes.get(event.parent, np.zeros((2, 2)))
+        elif isinstance(event, Mark):
+            at_marks.append(latest)
+        separated.append(event)
+    return separated, at_marks
 
 
 def smooth(

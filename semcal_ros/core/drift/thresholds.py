@@ -131,6 +131,10 @@ SAYS_NOTHING = TABLE.derived(
     "Of a measurement that says nothing beyond what is known: it moves the drift by a millionth of its deviation, and "
     "the covariance stays far from rounding.",
 )
+PULL_CONTAINED_MAX = TABLE.derived(
+    "PULL_CONTAINED_MAX", 0.9, "of what a covariance contains",
+    "That is taken out of it along one direction, so that a tenth is left and it stays one.",
+)
 DISPUTED_SIGMAS = TABLE.measured(
     "DISPUTED_SIGMAS", 2.0, "sigma",
     "At which a disputed position counts: if it is the right one, the stated sigma covers it twice. 1.5 times as "
