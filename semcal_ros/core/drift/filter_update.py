@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, solve_scaled
+from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.gating import (
@@ -39,7 +39,6 @@ from semcal_ros.core.drift.thresholds import (
     COMMON_SIGMAS,
     DISPUTED_SIGMAS,
     INNOVATION_CHI2_MAX,
-    PULL_CONTAINED_MAX,
     PULLED_SIGMAS,
     SAYS_NOTHING,
     SMALL_ZOOM,
@@ -139,20 +138,14 @@ def limit_by_pull(measure: Measure, drift: DriftState, pull: Array) -> Measure:
     seen = along @ measure.jacobian(drift)[:2]
     before, noise = seen @ drift.covariance @ seen, along @ measure.covariance[:2, :2] @ along
     if least <= COMMON_SIGMAS**2 * (noise - least):
-        return measure
-    pulled, independent = np.outer(along, along), measure.covariance.copy()
-    # Against a mean of frames, the noise has less than all of the pull.
-    direction = np.append(along, np.zeros(len(independent) - 2))
-    contained = 1.0 / float(direction @ solve_scaled(independent, direction))
-    independent[:2, :2] -= min(least, PULL_CONTAINED_MAX * contained) * pulled
-    known = replace(measure, independent=independent, common=least * pulled)
+        return measure.with_noise_alone()
     if before * noise >= least * (before + noise):
-        return known
+        return measure
     widest = noise * SAYS_NOTHING
     wider = min(before * least / (before - least), widest) if before > least else widest
     covariance = measure.covariance.copy()
     covariance[:2, :2] += (wider - noise) * np.outer(along, along)
-    return replace(known, covariance=covariance)
+    return replace(measure, covariance=covariance)
 
 
 def _look_for_flicker(state: TrackerState, frame: ScanFrame, match: Match) -> TrackerState:

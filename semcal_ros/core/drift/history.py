@@ -28,7 +28,7 @@ from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.similarity import SimilarityEstimate, SimilarityState, turn_drift
 from semcal_ros.core.drift.smoother import estimate_process_noise, separate_common, smooth
 from semcal_ros.core.drift.state import DriftState
-from semcal_ros.core.drift.thresholds import INNOVATION_CHI2_MAX
+from semcal_ros.core.drift.thresholds import INNOVATION_CHI2_MAX, LARGER_SIGMAS
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.failures import SEEN_AWAY
 
@@ -91,7 +91,9 @@ class DriftHistory:
             process_noise = drift_filter.process_noise
             events, common = separate_common(drift_filter.events)
             if process_noise.psd > 0.0:
-                process_noise = estimate_process_noise(drift_filter.start, events, process_noise)
+                process_noise = estimate_process_noise(
+                    drift_filter.start, events, process_noise, deviations=LARGER_SIGMAS
+                )
             states = smooth(drift_filter.start, events, process_noise)
             turns, first_s = similarity.smooth(), drift_filter.start.time_s
             doubts = _find_doubts(stretch.updates)

@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, equilibrate
 from semcal_ros.core.drift.camera_uncertainty import (
     apparent_zoom_shift,
     relative_scale_sigma,
@@ -32,6 +32,7 @@ from semcal_ros.core.drift.operations import CloneKeyframe, Measure
 from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import (
     DISTORTION_OF_SCALE,
+    LEAST_EIGENVALUE,
     SHEAR_COPY_NOISE,
     SHEAR_FLOOR_PX,
     SHEAR_LEFT_PX,
@@ -92,11 +93,13 @@ def make_measurement(
     share = averaged / (averaged + 1.0) if np.isfinite(averaged) else 1.0
     covariance = share * registration.covariance + np.eye(2) * SHIFT_FLOOR_PX**2
     term_s2, scan_s = now.acceleration_term_s2, now.acquisition_time_s
+    pull = unit @ registration.alignment.pull_px
+    common = np.outer(pull, pull)
     if now.timing is None or not np.all(np.isfinite(registration.alignment.joint_px)):
         shift = unit @ registration.shift_px + term_s2 * removed[2:]
-        return Measure(
-            key, shift, unit @ covariance @ unit.T, acceleration_term_s2=term_s2, scan_s=scan_s
-        )
+        covariance = unit @ covariance @ unit.T
+        measure = Measure(key, shift, covariance, acceleration_term_s2=term_s2, scan_s=scan_s)
+        return _tell_apart(measure, share, common)
     frame_s = now.timing.frame_time_s
     both = np.kron(np.diag([1.0, 1.0 / frame_s]), unit)
     part = max(SHEAR_OF_SHIFT, DISTORTION_OF_SCALE * relative_scale_sigma(now.camera))
@@ -113,7 +116,22 @@ def make_measurement(
         # What is left of the keyframe's shear is over its field; this frame shows a part of it.
         part_of_field = now.field_height / before.field_height
         ratio = part_of_field * before.timing.frame_time_s / frame_s
-    return Measure(key, shift, both @ joint @ both.T, ratio, term_s2, scan_s)
+    covariance = both @ joint @ both.T
+    return _tell_apart(Measure(key, shift, covariance, ratio, term_s2, scan_s), share, common)
+
+
+def _tell_apart(measure: Measure, share: float, common: Array) -> Measure:
+    """The measurement with the covariance (2, 2) of a pull, of which its own has a ``share``, told apart from the rest;
+    as it is without a pull, and where its covariance does not contain it, as that of a specimen that turns.
+    """
+    if not np.any(common):
+        return measure
+    independent = measure.covariance.copy()
+    independent[:2, :2] -= share * common
+    is_one = np.all(np.diag(independent) > 0.0)
+    if is_one and float(np.linalg.eigvalsh(equilibrate(independent)[0])[0]) > LEAST_EIGENVALUE:
+        return replace(measure, independent=independent, common=common)
+    return measure
 
 
 def keyframe_noise(measure: Measure) -> Array:

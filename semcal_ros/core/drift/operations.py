@@ -334,6 +334,12 @@ class Measure:
             wider[2:, 2:] += covariance / self.scan_s**2
         return wider
 
+    def with_noise_alone(self) -> Measure:
+        """The measurement of which nothing is taken for common to frames."""
+        if self.independent is None:
+            return self
+        return replace(self, independent=None, common=np.zeros((2, 2)))
+
     def without_common(self) -> Measure:
         """The measurement with the covariance of what differs from frame to frame alone."""
         if self.independent is None:

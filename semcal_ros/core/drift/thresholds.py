@@ -131,9 +131,9 @@ SAYS_NOTHING = TABLE.derived(
     "Of a measurement that says nothing beyond what is known: it moves the drift by a millionth of its deviation, and "
     "the covariance stays far from rounding.",
 )
-PULL_CONTAINED_MAX = TABLE.derived(
-    "PULL_CONTAINED_MAX", 0.9, "of what a covariance contains",
-    "That is taken out of it along one direction, so that a tenth is left and it stays one.",
+LEAST_EIGENVALUE = TABLE.derived(
+    "LEAST_EIGENVALUE", 1e-9, "of a scaled covariance",
+    "Below which it may be one by rounding alone, a million times that of a double.",
 )
 DISPUTED_SIGMAS = TABLE.measured(
     "DISPUTED_SIGMAS", 2.0, "sigma",

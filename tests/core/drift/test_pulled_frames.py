@@ -23,7 +23,8 @@ from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import limit_by_pull, widen_earlier
-from semcal_ros.core.drift.operations import Measure, Predict
+from semcal_ros.core.drift.operations import CloneKeyframe, Measure, Predict
+from semcal_ros.core.drift.smoother import Mark, estimate_process_noise, separate_common, smooth
 from semcal_ros.core.drift.state import BASE_SIZE, DriftState
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.long_tests import long_but
@@ -39,7 +40,10 @@ def _filter(psd: float = 1e-6) -> DriftFilter:
 
 
 def _measure(shift: Array, pull: Array) -> Measure:
-    return Measure(0, shift, NOISE**2 * np.eye(2) + np.outer(pull, pull))
+    own, common = NOISE**2 * np.eye(2), np.outer(pull, pull)
+    if not np.any(pull):
+        return Measure(0, shift, own)
+    return Measure(0, shift, own + common, independent=own, common=common)
 
 
 def _sigmas(filtered: DriftFilter) -> Array:
@@ -61,7 +65,11 @@ def test_no_mean_of_frames_that_are_pulled_alike_is_better_than_the_pull() -> No
 def test_a_pull_below_what_is_left_of_the_noise_changes_nothing() -> None:
     filtered, pull = _filter().apply(Predict(1.0)), np.array([0.02, 0.0])
     measure = _measure(np.zeros(2), pull)
-    assert limit_by_pull(measure, filtered.state, pull) is measure
+    limited = limit_by_pull(measure, filtered.state, pull)
+    np.testing.assert_array_equal(limited.covariance, measure.covariance)
+    # It is of chance, and another one in the next frame.
+    assert limited.without_common() is limited and not np.any(limited.common)
+    measure = _measure(np.zeros(2), np.zeros(2))
     assert limit_by_pull(measure, filtered.state, np.zeros(2)) is measure
 
 
@@ -96,6 +104,55 @@ def test_earlier_frames_were_pulled_by_as_much_less_as_they_moved_less() -> None
     assert widen_earlier(widened, latest, pull) is widened
     weak = np.array([4.0 * NOISE, 0.0])
     assert widen_earlier(filtered, _measure(np.array([0.0, 2.0]), weak), weak) is filtered
+
+
+def test_the_covariance_of_a_pull_is_told_apart_from_that_of_the_noise() -> None:
+    filtered, pull = _filter().apply(Predict(1.0)), np.array([0.3, 0.4])
+    measure = limit_by_pull(_measure(np.zeros(2), pull), filtered.state, pull)
+    independent = measure.without_common().covariance
+    np.testing.assert_allclose(independent, NOISE**2 * np.eye(2))
+    # What is found of earlier frames later on, and does not pull the others, is noise.
+    wider = measure.widened(np.eye(2))
+    np.testing.assert_allclose(wider.without_common().covariance, independent + np.eye(2))
+    np.testing.assert_allclose(wider.common, measure.common)
+    assert wider.without_common().without_common().common.tolist() == np.zeros((2, 2)).tolist()
+
+
+def test_a_pull_goes_with_the_keyframes_that_were_measured_under_it() -> None:
+    pulls = [np.diag([variance, 0.0]) for variance in (0.04, 0.01)]
+    measures = [Measure(key, np.zeros(2), np.eye(2), common=c) for key, c in enumerate(pulls)]
+    clone = CloneKeyframe(1, 0, np.zeros(4), 1.0, np.zeros((4, 4)))
+    events = (measures[0], Mark(), clone, measures[1], Mark())
+    separated, common = separate_common(events)
+    assert [type(event) for event in separated] == [type(event) for event in events]
+    np.testing.assert_allclose(common, pulls)
+
+
+def test_a_random_walk_under_a_pull_is_followed_with_hindsight() -> None:
+    """As a part of the noise of each frame, the pull makes the likeliest path one that nearly all frames contradict."""
+    rng, pull = np.random.default_rng(5), np.array([0.6, 0.0])
+    filtered, walk = _filter(psd=0.01), np.zeros(2)
+    truth = []
+    for k in range(1, 41):
+        walk = walk + rng.normal(0.0, 0.3, 2)
+        truth.append(walk)
+        seen = walk + 0.5 * pull + rng.normal(0.0, NOISE, 2)
+        filtered = filtered.apply(Predict(float(k)))
+        measure = limit_by_pull(_measure(seen, pull), filtered.state, pull)
+        filtered = filtered.update(measure).mark_frame()
+    events, common = separate_common(filtered.events)
+    noise = estimate_process_noise(filtered.start, events, filtered.process_noise)
+    errors, sigmas = [], []
+    for state, at, of_pull in zip(
+        smooth(filtered.start, events, noise), truth, common, strict=True
+    ):
+        errors.append(state.position - at)
+        sigmas.append(np.sqrt(np.diag(state.covariance[:2, :2] + of_pull)))
+    off, sigma = np.array(errors), np.array(sigmas)
+    # All frames have the pull, and what remains is their noise. With the pull as noise of each, 0.14 px remained.
+    np.testing.assert_allclose(off.mean(axis=0), 0.5 * pull, atol=0.05)
+    assert np.all(off.std(axis=0) < 1.2 * NOISE)
+    assert np.all(np.abs(off) < 3.0 * sigma)
 
 
 @pytest.mark.slow
