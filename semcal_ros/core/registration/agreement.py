@@ -34,6 +34,7 @@ from semcal_ros.core.arrays import Array, Mask, median, quantile
 from semcal_ros.core.registration.fractional_delay import gradients
 from semcal_ros.core.registration.inverse_compositional import TileStatistics
 from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
+from semcal_ros.core.registration.odd_bodies import find_odd_bodies
 from semcal_ros.core.registration.thresholds import (
     AGREEMENT_SIGMAS,
     BESIDES_MAX,
@@ -110,6 +111,8 @@ class Agreement:
         Part of all gradients that does not, and would pull the shift.
     informs
         (rows, cols) 0 to 1: what of the gradients of each tile is structure, whether it agrees or not.
+    odd
+        (rows, cols) the tiles of bodies that only differ from all others.
     """
 
     weights: Array
@@ -117,6 +120,7 @@ class Agreement:
     share: float
     pull: float
     informs: Array
+    odd: Mask
 
     @property
     def is_complete(self) -> bool:
@@ -143,13 +147,18 @@ def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: 
 
     A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
     """
+    own = _share_of_structure(gradient, pixels, sigma_px, noise)
+    return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
+
+
+def _share_of_structure(gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise) -> Array:
+    """(rows, cols) 0 to 1: what of the gradients of each tile for itself is structure."""
     energy = gradient[..., 0, 0] + gradient[..., 1, 1]
     expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
     # Smoothed noise has fewer independent pixels.
     scatter = expected * np.sqrt(shared_pixels(sigma_px) / pixels)
     signal = np.where(energy - expected > AGREEMENT_SIGMAS * scatter, energy - expected, 0.0)
-    own = signal / np.maximum(signal + expected, 1e-30)
-    return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
+    return np.asarray(signal / np.maximum(signal + expected, 1e-30))
 
 
 def find_agreement(
@@ -157,11 +166,15 @@ def find_agreement(
     noise: TileNoise,
     suspected: Mask | None = None,
     stretch_px: float = 0.0,
+    odd: Mask | None = None,
+    *,
+    looks_for_odd: bool = True,
 ) -> Agreement:
     """Which tiles agree with the shift at which they were compared.
 
     ``suspected`` (rows, cols) are those where something moved otherwise in the image before. ``stretch_px`` is by how
-    much another scale may move the edges against the middle.
+    much another scale may move the edges against the middle. ``odd`` (rows, cols) are the tiles of odd bodies at the
+    shift before, if those are looked for.
     """
     shared, count = shared_pixels(tiles.sigma_px), tiles.pixels
     weights = information_weights(tiles.gradient, count, tiles.sigma_px, noise)
@@ -189,6 +202,10 @@ def find_agreement(
     disagrees = disagrees | _moves(
         tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
     )
+    found_odd = np.zeros_like(disagrees)
+    if looks_for_odd:
+        found_odd = _find_odd(tiles, noise, louder, shared, disagrees, odd)
+        disagrees = disagrees | found_odd
     # By area: a bright tool has more of a gradient than all of the ground.
     share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
@@ -196,7 +213,24 @@ def find_agreement(
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * (tiles.gradient[..., 0, 0] + tiles.gradient[..., 1, 1])
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
-    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights)
+    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights, found_odd)
+
+
+def _find_odd(
+    tiles: TileStatistics,
+    noise: TileNoise,
+    louder: TileNoise,
+    shared: float,
+    disagrees: Mask,
+    before: Mask | None,
+) -> Mask:
+    """The tiles of bodies that move otherwise than all others, of those that do not disagree by themselves."""
+    own = _share_of_structure(tiles.gradient, tiles.pixels, tiles.sigma_px, noise)
+    own = np.where(disagrees, 0.0, own)
+    gain = np.maximum(tiles.gain, 1e-6)
+    left = shared * (gain**2 * louder.reference + louder.image)
+    information, variances = (by[..., None, None] * tiles.gradient for by in (own * gain, left))
+    return find_odd_bodies(own > 0.0, information, -tiles.scores, variances, before)
 
 
 def keep_bodies(disagrees: Mask, least: int) -> Mask:

@@ -154,21 +154,28 @@ def keep_specimen(
             for h in found
         ):
             continue
-        judge = _Judge(reference, noise, suspected, np.array(start.shift_px), stretch_px)
-        tried = align_reweighted(
-            level,
-            pyramid,
-            np.array(start.shift_px),
-            judge.first(first),
-            noise.reference,
-            judge,
-            looks=suspected is None,
-        )
-        if isinstance(tried, Rejection) or not tried.converged:
+        for looks_for_odd in (True, False):
+            judge = _Judge(
+                reference, noise, suspected, np.array(start.shift_px), stretch_px, looks_for_odd
+            )
+            tried = align_reweighted(
+                level,
+                pyramid,
+                np.array(start.shift_px),
+                judge.first(first),
+                noise.reference,
+                judge,
+                looks=suspected is None,
+            )
+            agreement, is_one = judge.latest, False
+            if not isinstance(tried, Rejection) and tried.converged:
+                assert agreement is not None
+                is_one = agreement.share >= PREDICTED_SHARE_MIN and agreement.are_bodies
+            # Of few bodies, what is left without an odd one may be too little.
+            if is_one or not judge.found_odd:
+                break
+        if isinstance(tried, Rejection) or agreement is None:
             continue
-        agreement = judge.latest
-        assert agreement is not None
-        is_one = agreement.share >= PREDICTED_SHARE_MIN and agreement.are_bodies
         if is_one and not any(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < SAME_SHIFT_PX for h in found
         ):
@@ -215,10 +222,15 @@ class _Judge:
         suspected: MovingTiles | None,
         shift_px: Array,
         stretch_px: float,
+        looks_for_odd: bool,
     ) -> None:
         level, self._noise, self._stretch_px = reference.levels[-1], noise, stretch_px
+        self._looks_for_odd = looks_for_odd
+        #: Whether a body was left out that only differs from all others.
+        self.found_odd = False
         self.latest: Agreement | None = None
         self._suspected: Mask | None = None
+        self._place: tuple[int, int, tuple[int, ...]] | None = None
         #: Of the tiles that were compared last.
         self.suspected: Mask | None = None
         if suspected is not None:
@@ -242,7 +254,21 @@ class _Judge:
         self.suspected = (
             None if self._suspected is None else self._suspected[tiles.rows, tiles.cols]
         )
-        self.latest = find_agreement(tiles, self._noise, self.suspected, self._stretch_px)
+        # At another shift, other tiles may be compared.
+        place = tiles.rows.start, tiles.cols.start, tiles.pixels.shape
+        odd = None
+        if self.latest is not None and place == self._place:
+            odd = self.latest.odd
+        self._place = place
+        self.latest = find_agreement(
+            tiles,
+            self._noise,
+            self.suspected,
+            self._stretch_px,
+            odd,
+            looks_for_odd=self._looks_for_odd,
+        )
+        self.found_odd |= bool(np.any(self.latest.odd))
         return self.latest.weights
 
     @property

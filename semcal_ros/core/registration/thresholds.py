@@ -261,6 +261,25 @@ TELLING_SIGMA_PX_MAX = TABLE.measured(
     "19 cases are decided alike, and errors change by 1.8 % at most.",
     command=TRIED,
 )
+ODD_BODIES_LEFT_MIN = TABLE.stated(
+    "ODD_BODIES_LEFT_MIN", 4, "bodies",
+    "That lie apart from the one that moves otherwise and agree with each other: of two or three, as many may be "
+    "tools.",
+)
+ODD_BODIES_SPREAD_MIN = TABLE.stated(
+    "ODD_BODIES_SPREAD_MIN", 0.5, "of the image in both directions",
+    "Over which these lie: the parts of a tool lie together, and those of a specimen anywhere.",
+)
+ODD_BODY_CHI2_MIN = TABLE.derived(
+    "ODD_BODY_CHI2_MIN", 16.0, "chi-square with 2 degrees of freedom",
+    "From which a body moves otherwise than all others: by chance one in 3000, exp(8), so that of twenty that all move "
+    "alike, one is left out in one of 150 images.",
+)
+ODD_BODY_STAYS = TABLE.stated(
+    "ODD_BODY_STAYS", 0.5, "of ODD_BODY_CHI2_MIN",
+    "From which one is that was so at the shift before: without it, such a shift may go to and fro between two, and is "
+    "refused.",
+)
 CHANGE_PRECISION = TABLE.measured(
     "CHANGE_PRECISION", 1e-3, "1 / px^2",
     "Prior of the terms of a shift that changes over the field, 1-sigma of 32 px about none: those that tiles in "

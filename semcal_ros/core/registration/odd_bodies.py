@@ -1,0 +1,175 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which bodies of a sparse image move otherwise than all others, such as a tool at rest over particles that drift.
+
+A tool may have more structure than all particles together, and a least-squares shift is its own. But it is one body,
+and they are many: each body that lies apart from the others is a witness of its own. Where the shifts of bodies differ
+by more than their noise, their scatter is estimated as well (random effects, DerSimonian and Laird 1986,
+doi:10.1016/0197-2456(86)90046-2), so that none of them outweighs the rest, and the one is left out that differs from
+all others by more than those do among themselves.
+
+It fails where less than five bodies lie apart from each other, as on a continuous ground, and where as many move in one
+way as in the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.registration.thresholds import (
+    ODD_BODIES_LEFT_MIN,
+    ODD_BODIES_SPREAD_MIN,
+    ODD_BODY_CHI2_MIN,
+    ODD_BODY_STAYS,
+    TELLING_SIGMA_PX_MAX,
+)
+
+
+@dataclass(frozen=True)
+class _Bodies:
+    """Shifts (n, 2) of n bodies with their covariances (n, 2, 2), and their numbers among the labels (rows, cols)."""
+
+    shifts: Array
+    covariances: Array
+    numbers: NDArray[np.intp]
+    labels: NDArray[np.int32]
+
+    def without(self, index: int) -> _Bodies:
+        kept = np.arange(len(self.numbers)) != index
+        return _Bodies(self.shifts[kept], self.covariances[kept], self.numbers[kept], self.labels)
+
+
+def find_odd_bodies(
+    informs: Mask, information: Array, pulls: Array, variances: Array, before: Mask | None = None
+) -> Mask:
+    """Find the bodies of tiles that move otherwise than all others.
+
+    Parameters
+    ----------
+    informs
+        (rows, cols) True in tiles with structure; those that touch are one body.
+    information, pulls
+        (rows, cols, 2, 2) and (rows, cols, 2) normal matrices of the tiles and their right sides, whose solution is a
+        shift in px.
+    variances
+        (rows, cols, 2, 2) covariances of the right sides.
+    before
+        (rows, cols) True in those that were odd at the shift before. They stay so unless they agree clearly, so that a
+        shift that is refined step by step comes to an end.
+
+    Returns
+    -------
+    (rows, cols) True in the tiles of those bodies. One that has more of the information than all others is among them
+    only where it lies at an edge of the image, over which a tool comes in, and does not reach the opposite one.
+    """
+    odd = np.zeros(informs.shape, dtype=bool)
+    bodies = _measure_bodies(informs, information, pulls, variances)
+    most = len(bodies.numbers) - ODD_BODIES_LEFT_MIN
+    for _ in range(min(most, len(bodies.numbers) // 2)):
+        limits = np.full(len(bodies.numbers), ODD_BODY_CHI2_MIN)
+        if before is not None:
+            known = np.isin(bodies.numbers, bodies.labels[before])
+            limits[known] *= ODD_BODY_STAYS
+        # Nearly always, all move alike. By one that outweighs the rest, each of the others is off.
+        if np.all(_compare_alike(bodies) < limits):
+            break
+        chi2 = np.array([_compare_one(bodies, k) for k in range(len(bodies.numbers))])
+        index = int(np.argmax(chi2 / limits))
+        if chi2[index] < limits[index]:
+            break
+        body, rest = bodies.labels == bodies.numbers[index], bodies.without(index)
+        precisions = 1.0 / np.trace(bodies.covariances, axis1=1, axis2=2)
+        outweighs = precisions[index] > 0.5 * precisions.sum()
+        if (outweighs and not _may_come_in(body)) or not _are_spread(rest):
+            break
+        odd |= body
+        bodies = rest
+    return odd
+
+
+def _may_come_in(body: Mask) -> bool:
+    """Whether a body lies at an edge or a corner of the image, and ends in it: a ground may reach from edge to edge."""
+    top, bottom, left, right = (
+        np.any(side) for side in (body[0], body[-1], body[:, 0], body[:, -1])
+    )
+    return bool((top != bottom or left != right) and not (top and bottom) and not (left and right))
+
+
+def _are_spread(bodies: _Bodies) -> bool:
+    """Whether bodies lie over half of the image in both directions: those of a tool lie together."""
+    found = np.isin(bodies.labels, bodies.numbers)
+    extents = [np.ptp(np.flatnonzero(found.any(axis=axis))) + 1 for axis in (1, 0)]
+    return bool(np.all(np.array(extents) >= ODD_BODIES_SPREAD_MIN * np.array(found.shape)))
+
+
+def _measure_bodies(informs: Mask, information: Array, pulls: Array, variances: Array) -> _Bodies:
+    """The shifts of bodies that tell one in both directions."""
+    count, labels = cv2.connectedComponents(informs.astype(np.uint8), connectivity=8)
+
+    def sum_up(values: Array) -> Array:
+        flat = values.reshape(labels.size, -1)
+        sums = np.stack([np.bincount(labels.ravel(), one, count) for one in flat.T], axis=-1)
+        return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[2:])[1:]
+
+    normal, right, scatter = (sum_up(values) for values in (information, pulls, variances))
+    trace = np.trace(normal, axis1=1, axis2=2)
+    determinant = normal[:, 0, 0] * normal[:, 1, 1] - normal[:, 0, 1] ** 2
+    solvable = np.flatnonzero(determinant > 1e-6 * trace**2)
+    inverse = np.linalg.inv(normal[solvable])
+    shifts = np.einsum("nij,nj->ni", inverse, right[solvable])
+    covariances = inverse @ scatter[solvable] @ inverse
+    largest = covariances[:, 0, 0] + covariances[:, 1, 1]
+    tells = (largest < TELLING_SIGMA_PX_MAX**2) & (largest > 0.0)
+    return _Bodies(
+        shifts[tells], covariances[tells], solvable[tells] + 1, np.asarray(labels, dtype=np.int32)
+    )
+
+
+def _compare_alike(bodies: _Bodies) -> Array:
+    """(n,) squared distances of each body from the mean of all others, in units of their noise."""
+    precisions = np.linalg.inv(bodies.covariances)
+    weighted = np.einsum("nij,nj->ni", precisions, bodies.shifts)
+    others = np.linalg.inv(precisions.sum(axis=0) - precisions)
+    means = np.einsum("nij,nj->ni", others, weighted.sum(axis=0) - weighted)
+    apart = bodies.shifts - means
+    solved = np.linalg.solve(bodies.covariances + others, apart[..., None])[..., 0]
+    return np.asarray(np.einsum("ni,ni->n", apart, solved))
+
+
+def _compare_one(bodies: _Bodies, index: int) -> float:
+    """Squared distance of one body from the mean of all others, in units of what is expected of it if it moves as they
+    do, their scatter included.
+    """
+    others = bodies.without(index)
+    precisions = np.linalg.inv(others.covariances)
+    information = precisions.sum(axis=0)
+    weighted = np.einsum("nij,nj->ni", precisions, others.shifts)
+    mean = np.linalg.solve(information, weighted.sum(axis=0))
+    apart = others.shifts - mean
+    chi2 = float(np.einsum("ni,nij,nj->", apart, precisions, apart))
+    freedom = 2.0 * (len(others.numbers) - 1)
+    squared = (precisions @ precisions).sum(axis=0)
+    scale = np.trace(information) - np.trace(np.linalg.solve(information, squared))
+    spread = np.eye(2) * max(0.0, (chi2 - freedom) / float(scale))
+    weights = np.linalg.inv(others.covariances + spread)
+    of_mean = np.linalg.inv(weights.sum(axis=0))
+    mean = of_mean @ np.einsum("nij,nj->i", weights, others.shifts)
+    off = bodies.shifts[index] - mean
+    return float(off @ np.linalg.solve(bodies.covariances[index] + spread + of_mean, off))

@@ -1,0 +1,151 @@
+# Copyright 2026 semcal_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bodies of a sparse image as witnesses: the one that moves otherwise is left out, however much structure it has."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from semcal_ros.core.arrays import Array, Mask
+from semcal_ros.core.drift.tracker import DriftTracker
+from semcal_ros.core.registration.odd_bodies import find_odd_bodies
+
+ROWS, COLS = 20, 24
+# Tiles of particles all over the field, and of a tool that comes in over the left edge.
+PARTICLES = [(2, 20), (4, 12), (7, 18), (10, 22), (12, 13), (15, 3), (15, 19), (18, 9)]
+TOOL = (slice(7, 11), slice(0, 7))
+
+
+def _scores(
+    parts: list[tuple[tuple[slice, slice], Array, float]], rng: np.random.Generator
+) -> tuple[Mask, Array, Array, Array]:
+    """What :func:`find_odd_bodies` takes, of parts of tiles that move by a shift, each tile with a sigma of its own."""
+    informs = np.zeros((ROWS, COLS), dtype=bool)
+    information, variances = np.zeros((2, ROWS, COLS, 2, 2))
+    pulls = np.zeros((ROWS, COLS, 2))
+    for place, shift, sigma in parts:
+        informs[place] = True
+        information[place] = variances[place] = np.eye(2) / sigma**2
+        shape = pulls[place].shape
+        pulls[place] = (shift + sigma * rng.normal(size=shape)) / sigma**2
+    return informs, information, pulls, variances
+
+
+def _one(tile: tuple[int, int]) -> tuple[slice, slice]:
+    return slice(tile[0], tile[0] + 1), slice(tile[1], tile[1] + 1)
+
+
+def _mask(place: tuple[slice, slice]) -> Mask:
+    mask = np.zeros((ROWS, COLS), dtype=bool)
+    mask[place] = True
+    return mask
+
+
+@pytest.mark.parametrize("moves", ["tool", "particles"])
+def test_a_tool_with_most_of_the_structure_is_the_odd_one_whichever_moves(moves: str) -> None:
+    rng, shift = np.random.default_rng(2), np.array([0.3, -0.2])
+    of_tool, of_rest = (shift, 0.0 * shift) if moves == "tool" else (0.0 * shift, shift)
+    parts = [(TOOL, of_tool, 0.05), *((_one(tile), of_rest, 0.08) for tile in PARTICLES)]
+    # 28 tiles of it against 8 that know less each.
+    np.testing.assert_array_equal(find_odd_bodies(*_scores(parts, rng)), _mask(TOOL))
+
+
+def test_where_all_move_alike_none_is_odd_but_by_chance() -> None:
+    rng = np.random.default_rng(3)
+    shift = np.array([0.3, -0.2])
+    parts = [(TOOL, shift, 0.05), *((_one(tile), shift, 0.08) for tile in PARTICLES)]
+    found = sum(bool(np.any(find_odd_bodies(*_scores(parts, rng)))) for _ in range(1000))
+    # Nine bodies, each by chance in one of 3000; the scatter of the others is estimated, too.
+    assert found <= 12
+
+
+def test_bodies_that_all_move_by_themselves_are_none_that_one_is_left_out_of() -> None:
+    rng = np.random.default_rng(4)
+    found = 0
+    for _ in range(100):
+        parts = [(_one(tile), rng.normal(0.0, 0.3, 2), 0.05) for tile in PARTICLES]
+        found += bool(np.any(find_odd_bodies(*_scores(parts, rng))))
+    # By noise alone, nearly each of these bodies would be one.
+    assert found <= 10
+
+
+def test_a_particle_that_rolls_is_left_out_wherever_it_is() -> None:
+    rng, still = np.random.default_rng(5), np.zeros(2)
+    parts = [(_one(tile), still, 0.05) for tile in PARTICLES]
+    parts[4] = (_one(PARTICLES[4]), np.array([0.6, 0.0]), 0.05)
+    np.testing.assert_array_equal(find_odd_bodies(*_scores(parts, rng)), _mask(_one(PARTICLES[4])))
+
+
+def test_what_may_be_the_specimen_is_not_left_out() -> None:
+    rng, still, shift = np.random.default_rng(6), np.zeros(2), np.array([0.4, 0.0])
+    ground = (slice(12, ROWS), slice(0, COLS))
+    above = [tile for tile in PARTICLES if tile[0] < 10]
+    # A ground from edge to edge under four particles; a flake in the middle; and the parts of a tool, near each other.
+    nearby = [(2, 3), (2, 7), (5, 3), (5, 7), (8, 5)]
+    flake = (slice(8, 12), slice(8, 12))
+    around = [tile for tile in PARTICLES if tile != (12, 13)]
+    for whole, others in ((ground, [*above, (8, 2)]), (flake, around), (ground, nearby)):
+        parts = [(whole, still, 0.05), *((_one(tile), shift, 0.05) for tile in others)]
+        assert not np.any(find_odd_bodies(*_scores(parts, rng)))
+
+
+def test_of_few_bodies_none_is_left_out() -> None:
+    rng, still, shift = np.random.default_rng(7), np.zeros(2), np.array([0.4, 0.0])
+    parts = [(TOOL, still, 0.05), *((_one(tile), shift, 0.05) for tile in PARTICLES[:3])]
+    assert not np.any(find_odd_bodies(*_scores(parts, rng)))
+    nothing = _scores([], rng)
+    assert not np.any(find_odd_bodies(*nothing))
+
+
+def _draw(shift: tuple[float, float], seed: int) -> np.ndarray:
+    """A rough tool at rest, which comes in over the upper edge, over fourteen particles that move."""
+    size = 288
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[0.0:size, 0.0:size]
+    picture = np.full((size, size), 55.0)
+    for cx, cy, radius, height in zip(
+        *rng.uniform(15.0, size - 15.0, (2, 14)),
+        rng.uniform(3.0, 6.0, 14),
+        rng.uniform(50.0, 110.0, 14),
+        strict=True,
+    ):
+        picture += height * ndtr((radius - np.hypot(x - cx - shift[0], y - cy - shift[1])) / 0.9)
+    tool = np.zeros((size, size), dtype=np.uint8)
+    corners = [[96, 0], [150, 0], [150, 110], [123, 138], [96, 110]]
+    cv2.fillPoly(tool, [np.array(corners, dtype=np.int32)], 255)
+    over = cv2.GaussianBlur(tool.astype(np.float64) / 255.0, (0, 0), 1.0)
+    rough = 180.0 + 6.0 * cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), 2.0) * 7.0
+    clean = picture * (1.0 - over) + rough * over
+    electrons = 0.6
+    noisy = np.random.default_rng([9, seed]).poisson(clean * electrons) / electrons
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def test_a_tool_at_rest_from_the_first_frame_on_is_not_followed() -> None:
+    """The drift is slow, so that the tool may hold it before anything is known to stay in place."""
+    tracker, accepted = DriftTracker(), 0
+    for k in range(30):
+        truth = np.array([-0.14 * k, -0.11 * k])
+        update = tracker.update(_draw((truth[0], truth[1]), k), float(k))
+        accepted += update.accepted
+        off = np.abs(update.drift_px - truth)
+        assert np.all((off < 0.1) | (off < 3.0 * update.sigma_px)), (k, off, update.sigma_px)
+    # Followed, it was 4 px off in the end, at a stated 0.03.
+    assert update.accepted and accepted >= 28
+    assert np.all(off < 0.15)
+    assert update.moving is not None or update.fixed is not None
