@@ -131,6 +131,7 @@ def _measure_bodies(informs: Mask, information: Array, pulls: Array, variances: 
     normal, right, scatter = (sum_up(values) for values in (information, pulls, variances))
     trace = np.trace(normal, axis1=1, axis2=2)
     determinant = normal[:, 0, 0] * normal[:, 1, 1] - normal[:, 0, 1] ** 2
+    # A straight edge tells one direction alone.
     solvable = np.flatnonzero(determinant > 1e-6 * trace**2)
     inverse = np.linalg.inv(normal[solvable])
     shifts = np.einsum("nij,nj->ni", inverse, right[solvable])
