@@ -219,7 +219,7 @@ def test_a_grid_that_a_tilt_carries_away_is_followed(peer: Peer) -> None:
         peer.wait_for(lambda: len(images) > 2 and progress.messages, "frames")
         assert peer.trigger(f"{SERVER}/acquire").success
         ended = ("done", "failed", "stopped")
-        peer.wait_for(lambda: progress["acquisition"] in ended, "the end", timeout_s=150.0)
+        peer.wait_for(lambda: progress["acquisition"] in ended, "the end", timeout_s=300.0)
         assert progress["acquisition"] == "done", server.output
         assert (progress["taken"], progress["left_out"]) == ("12", "0")
         way = np.array(
@@ -295,7 +295,7 @@ def test_what_goes_wrong_ends_it_with_the_reason_and_nothing_moves_any_more(
         peer.wait_for(lambda: len(images) > 2 and progress.messages, "frames")
         peer.wait_for(lambda: peer.trigger(f"{SERVER}/acquire").success, "the begin")
         # Of each view without a grid, every kind of pattern is looked for first.
-        peer.wait_for(lambda: progress["acquisition"] == "failed", "the end", timeout_s=120.0)
+        peer.wait_for(lambda: progress["acquisition"] == "failed", "the end", timeout_s=300.0)
         assert said in progress["request"]
         assert said in progress.text
         moved = len(stage)
