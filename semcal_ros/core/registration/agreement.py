@@ -147,7 +147,11 @@ def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: 
 
     A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
     """
-    own = _share_of_structure(gradient, pixels, sigma_px, noise)
+    return _spread(_share_of_structure(gradient, pixels, sigma_px, noise))
+
+
+def _spread(own: Array) -> Array:
+    """The weights of tiles, each as large as the best of it and those around."""
     return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
 
 
@@ -177,7 +181,8 @@ def find_agreement(
     shift before, if those are looked for.
     """
     shared, count = shared_pixels(tiles.sigma_px), tiles.pixels
-    weights = information_weights(tiles.gradient, count, tiles.sigma_px, noise)
+    own = _share_of_structure(tiles.gradient, count, tiles.sigma_px, noise)
+    weights = _spread(own)
     gain = _bound_gain(tiles, noise, weights)
     raw = tiles.image - 2.0 * gain * tiles.common + gain**2 * tiles.reference
     # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.
@@ -204,7 +209,7 @@ def find_agreement(
     )
     found_odd = np.zeros_like(disagrees)
     if looks_for_odd:
-        found_odd = _find_odd(tiles, noise, louder, shared, disagrees, odd)
+        found_odd = _find_odd(tiles, np.where(disagrees, 0.0, own), louder, shared, odd)
         disagrees = disagrees | found_odd
     # By area: a bright tool has more of a gradient than all of the ground.
     share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
@@ -217,18 +222,13 @@ def find_agreement(
 
 
 def _find_odd(
-    tiles: TileStatistics,
-    noise: TileNoise,
-    louder: TileNoise,
-    shared: float,
-    disagrees: Mask,
-    before: Mask | None,
+    tiles: TileStatistics, own: Array, noise: TileNoise, shared: float, before: Mask | None
 ) -> Mask:
-    """The tiles of bodies that move otherwise than all others, of those that do not disagree by themselves."""
-    own = _share_of_structure(tiles.gradient, tiles.pixels, tiles.sigma_px, noise)
-    own = np.where(disagrees, 0.0, own)
+    """The tiles of bodies that move otherwise than all others, of those whose gradients have a share ``own`` (rows,
+    cols) of structure.
+    """
     gain = np.maximum(tiles.gain, 1e-6)
-    left = shared * (gain**2 * louder.reference + louder.image)
+    left = shared * (gain**2 * noise.reference + noise.image)
     information, variances = (by[..., None, None] * tiles.gradient for by in (own * gain, left))
     return find_odd_bodies(own > 0.0, information, -tiles.scores, variances, before)
 
