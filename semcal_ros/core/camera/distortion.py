@@ -112,8 +112,10 @@ def distort_jacobians(
     xi_u: Array | float = 0.0,
     xi_v: Array | float = 0.0,
     xi_w: Array | float = 0.0,
+    *,
+    points_only: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Distort points, with derivatives.
+    """Distort points, with derivatives; with ``points_only`` none by the coefficients, and ``df_dxi`` is empty.
 
     Returns
     -------
@@ -133,38 +135,41 @@ def distort_jacobians(
     along = 2.0 * growth * xi_radial
     tangential_x, tangential_y = 2.0 * xi_tangential * x, 2.0 * xi_tangential * y
     # In memory the points come last, which is faster; in shape they come first, as elsewhere.
-    df_dq, df_dxi = np.empty((2, 2, len(q))), np.empty((len(LENS_NAMES), 2, len(q)))
+    df_dq = np.empty((2, 2, len(q)))
     df_dq[0, 0] = along * x * x + factor + 3.0 * tangential_x
     df_dq[0, 1] = along * x * y + tangential_y
     df_dq[1, 0] = along * x * y + tangential_x
     df_dq[1, 1] = along * y * y + factor + 3.0 * tangential_y
-    df_dxi[0] = growth * r2 * q.T
-    df_dxi[1] = bracket.T
-    df_dxi[2, 0], df_dxi[2, 1] = -r2 * y, r2 * x
-    df_dxi[3, 0], df_dxi[3, 1] = bracket[:, 0], -bracket[:, 1]
-    df_dxi[4] = 2.0 * x * y
-    df_dxi[5, 0], df_dxi[5, 1] = df_dxi[4, 0], -df_dxi[4, 1]
     spiral, across = np.asarray(xi_s, dtype=np.float64), np.asarray(xi_u, dtype=np.float64)
     if np.any(across):
-        f = f + across[..., None] * df_dxi[3].T
+        f = f + across[..., None] * bracket * [1.0, -1.0]
         df_dq[0, 0] += 6.0 * across * x
         df_dq[0, 1] += 2.0 * across * y
         df_dq[1, 0] -= 2.0 * across * x
         df_dq[1, 1] -= 6.0 * across * y
     if np.any(spiral):
-        f = f + spiral[..., None] * df_dxi[2].T
+        f = f + spiral[..., None] * np.stack([-r2 * y, r2 * x], axis=1)
         df_dq[0, 0] -= 2.0 * spiral * x * y
         df_dq[0, 1] -= spiral * (x * x + 3.0 * y * y)
         df_dq[1, 0] += spiral * (3.0 * x * x + y * y)
         df_dq[1, 1] += 2.0 * spiral * x * y
     crossed, twisted = np.asarray(xi_v, dtype=np.float64), np.asarray(xi_w, dtype=np.float64)
     if np.any(crossed) or np.any(twisted):
-        f = f + crossed[..., None] * df_dxi[4].T + twisted[..., None] * df_dxi[5].T
+        product = (2.0 * x * y)[:, None]
+        f = f + crossed[..., None] * product + twisted[..., None] * product * [1.0, -1.0]
         of_x, of_y = 2.0 * (crossed + twisted), 2.0 * (crossed - twisted)
         df_dq[0, 0] += of_x * y
         df_dq[0, 1] += of_x * x
         df_dq[1, 0] += of_y * y
         df_dq[1, 1] += of_y * x
+    df_dxi = np.empty((0 if points_only else len(LENS_NAMES), 2, len(q)))
+    if not points_only:
+        df_dxi[0] = growth * r2 * q.T
+        df_dxi[1] = bracket.T
+        df_dxi[2, 0], df_dxi[2, 1] = -r2 * y, r2 * x
+        df_dxi[3, 0], df_dxi[3, 1] = bracket[:, 0], -bracket[:, 1]
+        df_dxi[4] = 2.0 * x * y
+        df_dxi[5, 0], df_dxi[5, 1] = df_dxi[4, 0], -df_dxi[4, 1]
     return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, (0, 1), (2, 1))
 
 

@@ -38,6 +38,7 @@ from semcal_ros.core.camera.scan_distortion import (
     ALONG_COUNT,
     SCAN_NAMES,
     Raster,
+    deflection_stretch,
     linearise_scan,
     raw_from_deflection,
 )
@@ -85,7 +86,7 @@ class ProjectionJacobians:
         (n, 2, 3) derivative with respect to the sem-frame point, px per m.
     d_parameters
         (n, 2, P) derivative with respect to the parameters in the order of
-        :data:`ALL_NAMES`.
+        :data:`ALL_NAMES`; (n, 2, 0) where it was not asked for.
     """
 
     xy: Array
@@ -127,9 +128,9 @@ def _distortion(parameters: Array) -> tuple[list[Array], Array | None]:
 
 
 def project_points_with_jacobians(
-    parameters: Array, xyz_m: Array, raster: Raster
+    parameters: Array, xyz_m: Array, raster: Raster, *, points_only: bool = False
 ) -> ProjectionJacobians:
-    """Project points to raw pixels, with analytic derivatives.
+    """Project points to raw pixels, with analytic derivatives; with ``points_only`` those by the points alone.
 
     In memory the points come last, so that each derivative of all points is contiguous.
     """
@@ -148,24 +149,28 @@ def project_points_with_jacobians(
     ideal = np.stack([px + scaled_u, py + scaled_v], axis=1)
 
     lens, amplitudes = _distortion(table)
-    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, *lens)
+    f, df_dq, df_dxi = distort_jacobians((ideal - centre) / norm_px, *lens, points_only=points_only)
     xy = centre + norm_px * f
-    scan = None
+    scan, stretch = None, None
     if amplitudes is not None:
         xy = raw_from_deflection(xy, amplitudes, raster)
-        scan = linearise_scan(xy, amplitudes, raster)
-    d_xyz, d_parameters = np.empty((2, 3, n)), np.zeros((2, count, n))
+        if points_only:
+            stretch = deflection_stretch(xy, amplitudes, raster).T
+        else:
+            scan = linearise_scan(xy, amplitudes, raster)
+            stretch = scan.stretch
+    d_xyz, d_parameters = np.empty((2, 3, n)), np.zeros((2, 0 if points_only else count, n))
     up, tilt = rho * inverse_w, z * inverse_w
     for row in (0, 1):
-        by_x, by_y, by_xi = df_dq[:, row, 0], df_dq[:, row, 1], norm_px * df_dxi[:, row].T
-        per_stretch = 1.0
-        if scan is not None:
-            per_stretch = 1.0 / scan.stretch[row]
-            by_x, by_y, by_xi = per_stretch * by_x, per_stretch * by_y, per_stretch * by_xi
+        per_stretch = 1.0 if stretch is None else 1.0 / stretch[row]
+        by_x, by_y = per_stretch * df_dq[:, row, 0], per_stretch * df_dq[:, row, 1]
         along = by_x * scaled_u + by_y * scaled_v
         d_xyz[row, 0] = by_x * scale * a
         d_xyz[row, 1] = scale * (by_x * skew + by_y / a)
         d_xyz[row, 2] = -along * up
+        if points_only:
+            continue
+        by_xi = per_stretch * norm_px * df_dxi[:, row].T
         d_parameters[row, 0] = along / m
         d_parameters[row, 1] = by_x * scale * x - by_y * scaled_v / a
         d_parameters[row, 2] = by_x * scale * y

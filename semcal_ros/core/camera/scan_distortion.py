@@ -183,9 +183,14 @@ def deflection_shift(xy: Array, amplitudes: Array, raster: Raster) -> Array:
 
 def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return the (n, 2) derivative of the deflection along each axis by the raw pixel, at raw pixels (n, 2)."""
-    if not np.any(amplitudes):
-        return np.ones_like(xy)
-    return linearise_scan(xy, amplitudes, raster).stretch.T
+    out = np.ones_like(xy)
+    for axis in (0, 1):
+        of_axis = _amplitudes(amplitudes, axis)
+        if np.any(of_axis):
+            scale = _scale(raster, axis)
+            u = (xy[:, axis] - raster.middle_px[axis]) / scale
+            out[:, axis] += raster.norm_px / scale * _make_curve(of_axis).value(u)[1]
+    return out
 
 
 def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) -> Array:

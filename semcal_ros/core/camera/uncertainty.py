@@ -70,7 +70,9 @@ def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     centre = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
     points = camera.sem_from_ideal(np.concatenate([centre, xy]))
     jacobian = camera.project_jacobian(points)
-    moved = project_points_with_jacobians(camera.parameters, points, camera.raster).d_xyz[:, :, :2]
+    moved = project_points_with_jacobians(
+        camera.parameters, points, camera.raster, points_only=True
+    ).d_xyz[:, :, :2]
     # Where nothing is seen at the centre, nothing is relative to it.
     shift = np.full((2, jacobian.shape[2]), np.nan)
     if np.all(np.isfinite(moved[0])) and np.all(np.isfinite(jacobian[0])):
@@ -89,7 +91,9 @@ def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
         return np.zeros(len(xy))
     points = camera.sem_from_ideal(xy)
     # The moves of the specimen span the same images with and without the small residual field.
-    moved = project_points_with_jacobians(camera.parameters, points, camera.raster).d_xyz
+    moved = project_points_with_jacobians(
+        camera.parameters, points, camera.raster, points_only=True
+    ).d_xyz
     jacobian = camera.project_jacobian(points)
     known = np.all(np.isfinite(jacobian), axis=(1, 2))
     if not np.any(known):

@@ -92,7 +92,9 @@ def compute_rms_without_distortion(result: CalibrationResult) -> dict[float, flo
         straight[[PARAMETER_NAMES.index("xi_r"), PARAMETER_NAMES.index("xi_t")]] = 0.0
         turned = view.board_xy_m @ rotation[:, :2].T
         points = turned + translation
-        jacobian = project_points_with_jacobians(straight, points, camera.raster).d_xyz
+        jacobian = project_points_with_jacobians(
+            straight, points, camera.raster, points_only=True
+        ).d_xyz
         x, y, z = turned.T
         o = np.zeros_like(x)
         turns = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)

@@ -55,13 +55,16 @@ def test_parameter_derivatives(index, rho):
     np.testing.assert_allclose(analytic, numeric, atol=2e-6 * np.abs(numeric).max())
 
 
+@pytest.mark.parametrize("points_only", [False, True])
 @pytest.mark.parametrize("axis", range(3))
-def test_point_derivatives(axis):
+def test_point_derivatives(axis, points_only):
     step = 1e-8
     delta = np.zeros(3)
     delta[axis] = step
     numeric = _central(lambda x: project_points(PARAMETERS, x, RASTER), POINTS, delta) / step
-    analytic = project_points_with_jacobians(PARAMETERS, POINTS, RASTER).d_xyz[:, :, axis]
+    found = project_points_with_jacobians(PARAMETERS, POINTS, RASTER, points_only=points_only)
+    analytic = found.d_xyz[:, :, axis]
+    assert found.d_parameters.shape[2] == (0 if points_only else len(ALL_NAMES))
     np.testing.assert_allclose(analytic, numeric, atol=2e-6 * np.abs(numeric).max())
 
 
