@@ -289,7 +289,12 @@ def test_a_recording_that_is_played_too_fast(
     with running("rectifier", settings):
         watch.wait_heard(node, "image_rect")
         # The first frame for itself: what comes before the first one that the node gets, it cannot count.
-        playing = {"bag": tmp_path / "bag", "rate": 0.01, "start_paused": True, "wait_for_subscribers": 1}
+        playing = {
+            "bag": tmp_path / "bag",
+            "rate": 0.01,
+            "start_paused": True,
+            "wait_for_subscribers": 1,
+        }
         with running("bag_player", playing) as player:
             peer.wait_for(lambda: peer.node.count_publishers("image_raw") == 1, "the player")
             peer.call(SetBool, "bag_player/pause", SetBool.Request(data=False))

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -598,5 +599,9 @@ def select(started: Start, residual: str) -> Selection:
         adjustment, field, pattern = _add_field(noisy, adjustment, always=False)
         if field is not None and more is not plain[1]:
             # What the products stood for is a part of what the field describes, which has them among its patterns.
-            adjustment, field, pattern = _add_field(*plain, always=True)
+            # Where there is no solution without them, they stay.
+            with suppress(UnusableCalibrationError):
+                instead = _add_field(*plain, always=True)
+                if instead[1] is not None:
+                    adjustment, field, pattern = instead
     return Selection(setup, adjustment, field, pattern, excess_px(setup, adjustment))

@@ -17,14 +17,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from semcal_ros.core.calibration import select
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, UnusableCalibrationError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.microscope import Exponential, Residual
 from semcal_ros.synthetic.stage import grid_views
@@ -209,3 +211,25 @@ def test_modes_and_methods_are_checked():
         CalibrationOptions(residual="maybe")
     with pytest.raises(InvalidValueError, match='method "joint"'):
         CalibrationOptions(method="discrete", residual="on")
+
+
+@pytest.mark.parametrize("instead", ["unsolvable", "lost corners", "found"])
+def test_products_stay_where_a_field_cannot_take_their_place(instead, monkeypatch):
+    """By what the parts of a selection return: no microscope of the fleet has come to this."""
+
+    def add_field(setup, adjustment, *, always):
+        if not always:
+            return "with products", "a field", None
+        if instead == "unsolvable":
+            raise UnusableCalibrationError("equations of the residual field")
+        return "plain", "a field" if instead == "found" else None, None
+
+    monkeypatch.setattr(select, "select_and_adjust", lambda *_: "plain")
+    monkeypatch.setattr(select, "_anneal", lambda _setup, noisy, adjustment: (noisy, adjustment))
+    monkeypatch.setattr(select, "add_products", lambda *_: "products")
+    monkeypatch.setattr(select, "_add_field", add_field)
+    monkeypatch.setattr(select, "excess_px", lambda *_: 0.0)
+    started = SimpleNamespace(setup=None, tempered=None, functions=None, state=None, spread=None)
+    found = select.select(started, "auto")
+    assert found.adjustment == ("plain" if instead == "found" else "with products")
+    assert found.field == "a field"

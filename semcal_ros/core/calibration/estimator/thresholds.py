@@ -43,6 +43,11 @@ DAMPING_MAX = TABLE.derived(
     "A step has no length left: it moves the start of an unknown by 1e-10 of what the equations ask for, some "
     "roundings of its value.",
 )
+DAMPING_LOWERED_MIN = TABLE.cost(
+    "DAMPING_LOWERED_MIN", 0.1, "of the damping before",
+    "After a step that did all that was predicted. Nielsen (IMM-REP-1999-05) has a third; steps are few where the "
+    "problem is nearly linear.",
+)
 PREDICTED_MAX = TABLE.stated(
     "PREDICTED_MAX", 1e3, "tolerances",
     "That the quadratic model may still predict at the end: where it fails, its prediction says little.",

@@ -15,9 +15,10 @@
 """Descent to a minimum of a sum of squares: Levenberg-Marquardt, with any kind of state.
 
 No step that is taken raises the cost; one that would is tried again with a larger damping, which
-makes it shorter.
+makes it shorter. How well the quadratic model predicted a step decides by how much the next one is damped.
 
-Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 4.
+Triggs et al., Bundle Adjustment - A Modern Synthesis, doi:10.1007/3-540-44480-7_21, section 4; Nielsen, Damping
+Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from semcal_ros.core.calibration.estimator.thresholds import (
+    DAMPING_LOWERED_MIN,
     DAMPING_MAX,
     DAMPING_MIN,
     FIRST_DAMPING,
@@ -108,19 +110,29 @@ def descend(
     damping, relative = first_damping, 0.0
     for iteration in range(1, max_iterations + 1):
         solve = linearise(state)
-        step = solve(damping)
+        step, growth = solve(damping), 2.0
         while (step is None or not step.cost <= cost) and damping < DAMPING_MAX:
-            damping *= 10.0
+            damping, growth = growth * damping, 2.0 * growth
             step = solve(damping)
         if step is None:
             return Descent(state, cost, iteration, DescentStatus.SINGULAR, relative)
         if not step.cost <= cost:
             return Descent(state, cost, iteration, DescentStatus.NO_DESCENT, relative)
         decrease, cost, state = cost - step.cost, step.cost, step.state
-        damping = max(0.1 * damping, DAMPING_MIN)
+        damping = max(_damping_change(decrease, step.predicted) * damping, DAMPING_MIN)
         relative = decrease / max(cost, np.finfo(np.float64).tiny)
         small = decrease <= tolerance * cost
         little = PREDICTED_MAX * tolerance * (1.0 + cost) if predicted is None else predicted
         if small and step.predicted <= little:
             return Descent(state, cost, iteration, DescentStatus.SMALL_DECREASE, relative)
     return Descent(state, cost, max_iterations, DescentStatus.ITERATION_LIMIT, relative)
+
+
+def _damping_change(decrease: float, predicted: float) -> float:
+    """Return the factor of the damping after a step that lowered the cost by ``decrease``.
+
+    One that did half of what was predicted leaves it as it is: in a curved valley, a smaller damping would make the
+    next step fail, and that would have to be tried twice.
+    """
+    part = min(decrease / predicted, 1.0) if predicted > 0.0 else 1.0
+    return max(DAMPING_LOWERED_MIN, 1.0 - (2.0 * part - 1.0) ** 3)
