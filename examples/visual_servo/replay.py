@@ -91,7 +91,8 @@ def replay(folder: Path, bag: Path, goal: PlanePose, rate: float) -> dict[int, n
     try:
         nodes.start("parameter_server", calibrated)
         nodes.start("stream_corrector", {**calibrated, **every})
-        nodes.start("visual_servo", {**common, **goals, "start": True})
+        # Not started: no stage obeys here, and a servo that sees this measures no more.
+        nodes.start("visual_servo", {**common, **goals, "start": False})
         queue = QoSProfile(depth=100)
         node.create_subscription(PoseWithCovarianceStamped, "visual_servo/error", on_error, queue)
         # The servo hears the corrector; both hear the magnification, and the corrector the images.

@@ -153,8 +153,7 @@ def test_nano_ball(tmp_path: Path) -> None:
 
 
 # Four processes must get their turns within a stream's interval.
-# In a replay no stage obeys: where its first command comes early after a frame, the servo sees that nothing follows.
-@pytest.mark.flaky(reruns=2)
+@pytest.mark.flaky(reruns=1)
 @pytest.mark.long
 def test_visual_servo(tmp_path: Path) -> None:
     out = tmp_path / "out"
