@@ -39,7 +39,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.bundle_adjustment import variance_factor
@@ -471,7 +471,7 @@ def _propose_untilted(setup: Setup, joint: JointFit, fit: MethodFit) -> list[Fin
     rise = (
         2.0 * (result.cost - own.result.cost) / max(variance_factor(own.problem, own.result), 1.0)
     )
-    limit = float(chi2.ppf(UNTILTED_CONFIDENCE, 2 * len(setup.views)))
+    limit = float(chdtri(2 * len(setup.views), 1.0 - UNTILTED_CONFIDENCE))
     if rise > limit:
         return []
     try:

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from semcal_ros.core.arrays import equilibrate
 from semcal_ros.core.ladder.adjustment import LadderFit, add_up, prior_information, share_noise
@@ -101,9 +101,7 @@ class Disagreement:
     @property
     def is_chance(self) -> bool:
         """Whether a calibration that still holds shows as much."""
-        return self.chi_square <= float(
-            stats.chi2.isf(DISAGREEMENT_FALSE_ALARMS, max(self.freedom, 1))
-        )
+        return self.chi_square <= float(chdtri(max(self.freedom, 1), DISAGREEMENT_FALSE_ALARMS))
 
 
 def measure_disagreement(setup: LadderSetup, fit: LadderFit) -> Disagreement:

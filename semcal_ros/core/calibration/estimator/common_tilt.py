@@ -34,7 +34,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
@@ -108,7 +108,7 @@ def _walk(adjustment: Adjustment, column: int) -> list[_Camera]:
     problem, result = adjustment.problem, adjustment.result
     rho = float(result.state.theta[column])
     factor = max(variance_factor(problem, result), 1.0)
-    chance = 0.5 * factor * float(chi2.ppf(COMMON_TILT_CONFIDENCE, 3 * len(problem.group)))
+    chance = 0.5 * factor * float(chdtri(3 * len(problem.group), 1.0 - COMMON_TILT_CONFIDENCE))
     limit = COMMON_TILT_SLACK * chance
     least = float(np.sum(view_costs(problem, result.state)))
     tolerance = PIVOT_TOLERANCE / result.cost

@@ -29,7 +29,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import Problem
@@ -126,7 +126,7 @@ class ShapeTest:
     @property
     def z_score(self) -> float:
         """The normal deviate that is as improbable (two-sided); NaN where too few views were seen."""
-        return float(norm.isf(0.5 * self.p_value))
+        return abs(float(ndtri(0.5 * self.p_value)))
 
     @property
     def significant(self) -> bool:
@@ -314,7 +314,7 @@ def _test(estimate: _Estimate, given: Sequence[str], name: str) -> Change:
         tuple(values[own].tolist()),
         tuple(np.sqrt(np.diag(covariance))[own].tolist()),
         gain,
-        float(chi2.sf(gain, len(group))),
+        float(chdtrc(len(group), gain)),
     )
 
 
