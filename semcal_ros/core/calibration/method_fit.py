@@ -68,9 +68,9 @@ class Finding:
             return math.nan, math.nan
 
     def sentence(self, model: CalibrationModel) -> str:
-        """Return the sentence, with what it costs in nm."""
+        """Return the sentence, with what it costs in nm, if that is known and not nothing."""
         cost_nm, g = self.cost(model)
-        if not math.isfinite(cost_nm):
+        if not math.isfinite(cost_nm) or cost_nm == 0.0:
             return self.text
         return f"{self.text} (costs {in_nm(1e-9 * cost_nm)} at {rounded_magnification(g)})"
 

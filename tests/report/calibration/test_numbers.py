@@ -383,5 +383,6 @@ def test_all_kinds_of_findings_are_ranked_together_by_nm(result: CalibrationResu
     texts = replace(result, findings=(unknown, px, there, everywhere)).warnings
     assert [re.sub(r" \(.*", "", text) for text in texts] == [own.text for own in ranked]
     assert f"at {result.model.magnification_range[0]:.0f}x" in texts[0]
+    assert Finding("nothing", 0.0).sentence(result.model) == "nothing"
     (cost,) = re.findall(r"costs ([\d.]+) nm", texts[1])
     assert float(cost) == pytest.approx(0.015 * size * at[1500.0], rel=0.05)
