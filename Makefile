@@ -47,9 +47,9 @@ format: setup ## bring the source into the form that lint wants
 # they would not be on a microscope's computer.
 # Tests of several processes are tried once more, but no more than four in a run: the fifth one fails.
 PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 3 --dist worksteal --rerun-show-tracebacks --max-suite-reruns=4
-# No test may take longer than 400 s. One that waits within the middleware for ever does not hear its time limit: its
+# No test may take longer than 600 s. One that waits within the middleware for ever does not hear its time limit: its
 # process is ended.
-END_STUCK := -o faulthandler_timeout=500 -o faulthandler_exit_on_timeout=true
+END_STUCK := -o faulthandler_timeout=700 -o faulthandler_exit_on_timeout=true
 
 test: lint ## style, types, and all tests but the long ones (6 to 14 minutes on two cores)
 	@$(PYTEST) $(END_STUCK) $(PYTEST_ARGS) tests
