@@ -185,7 +185,8 @@ def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, A
     cameras = problem.cameras(state.theta)[problem.group]
     if problem.effects is not None:
         cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
-    return rotated, rotated + state.translations_m[view], cameras[view]
+    # In memory the points come last, so that each parameter of all points is contiguous.
+    return rotated, rotated + state.translations_m[view], np.take(cameras.T, view, axis=1).T
 
 
 def _drift_shift(problem: Problem, state: State) -> Array | float:
