@@ -637,9 +637,9 @@ def check_fit(setup: LadderSetup, fit: LadderFit, links: Sequence[Link]) -> None
     tilt, sigma = _tilt(setup, fit)
     if tilt > STEEPEST_RAD and tilt > 3.0 * sigma:
         raise CalibrationError(
-            f"a specimen that is tilted by {np.degrees(tilt):.1f} degrees",
-            expected=f"one that lies flat, to {np.degrees(STEEPEST_RAD):.0f} degrees",
-            do="untilt the stage, and record the ladder again",
+            f"a specimen that looks tilted by {np.degrees(tilt):.1f} degrees",
+            expected=f"one that lies flat, to {np.degrees(STEEPEST_RAD):.0f} degrees, and is at rest",
+            do="untilt the stage, or wait until nothing moves or charges, and record the ladder again",
         )
     creep, creep_sigma = creep_of(setup, fit)
     pictures = len(setup.pictures)

@@ -142,7 +142,8 @@ def test_a_crack_that_opens_slowly_stays_within_the_stated_sigma() -> None:
 
 
 def test_a_crack_that_opens_fast_is_refused() -> None:
-    with pytest.raises(CalibrationError, match=r"one plane at rest|agree on one specimen"):
+    # A tilt of 61 degrees is what fits best.
+    with pytest.raises(CalibrationError, match=r"expected .* at rest"):
         _extend(_crack(6.0))
 
 
