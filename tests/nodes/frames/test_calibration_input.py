@@ -147,17 +147,17 @@ def test_the_same_text_from_an_earlier_time_does_not_make_way_for_an_older_one()
 
 def test_what_this_node_has_published_does_not_come_back_as_news(file: str) -> None:
     bench = Bench(file)
-    published: list[Any] = []
+    published_ns: list[int] = []
 
     class Publisher:
-        publish = staticmethod(published.append)
+        def publish(self, _message: Any) -> None:
+            published_ns.append(time.time_ns())
 
-    sent_ns = time.time_ns()
     bench.input.publish(Publisher())
     assert bench.input.has_published
     bench.receive(0.10, sent_ns=1)
     bench.wait_for(0.10)
-    bench.receive(0.05, sent_ns=sent_ns)
+    bench.receive(0.05, sent_ns=published_ns[0])
     bench.receive(0.11, sent_ns=time.time_ns() + 10**12)
     bench.wait_for(0.11)
     assert bench.changes == [0.10, 0.11]
