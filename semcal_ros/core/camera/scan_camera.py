@@ -697,7 +697,7 @@ class RectifiedCamera(ScanCamera):
         q = (source.project_ideal(points[known]) - source._centre) / source.norm_px
         # The residual field displaces a pixel and is inverted at the same place: it cancels.
         by = by * source._stretch(xy)[:, :, None]
-        lens = distort_jacobians(q, *source._lens)[1]
+        lens = distort_jacobians(q, *source._lens, points_only=True)[1]
         by = source._rect_from_ideal @ np.linalg.solve(lens, by)
         by_rectified = by @ np.linalg.inv(_extend(source._rectified_from_parameters, by.shape[2]))
         return _scatter_rows(by_rectified, known, len(points))

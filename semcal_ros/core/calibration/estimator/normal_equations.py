@@ -51,7 +51,7 @@ def normal_equations(
 ) -> NormalEquations:
     """Compute the Huber-weighted normal equations of every view, with all that is known of the view.
 
-    With ``poses_only`` the corners fill only the columns of the view's own unknowns, which takes a third of the time.
+    With ``poses_only`` the corners fill only the columns of the view's own unknowns, which is faster.
     ``for_step`` adds the size of the second derivatives by the turns of the views: steps by the first alone go astray
     where a tilt acts by its square. By its size, also where a flat view is the highest point and not the lowest, a step
     leads downwards (saddle-free Newton: Dauphin et al. 2014, arXiv:1406.2572).

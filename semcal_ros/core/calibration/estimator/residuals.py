@@ -289,11 +289,11 @@ class CornerRows:
 class _CornerDerivatives:
     """Derivatives (2, size, N) of the projections of all corners by each block of unknowns, or those of the view."""
 
-    def __init__(self, problem: Problem, state: State, *, of_view_only: bool):
+    def __init__(self, problem: Problem, state: State, *, poses_only: bool):
         self.problem, self.state = problem, state
         self.rotated, points, cameras = _points_and_cameras(problem, state)
         self.jacobians: ProjectionJacobians = project_points_with_jacobians(
-            cameras, points, problem.raster, points_only=of_view_only
+            cameras, points, problem.raster, points_only=poses_only
         )
         self.by_point = np.moveaxis(self.jacobians.d_xyz, 0, -1)  # (2, 3, N) in the sem frame
 
@@ -371,7 +371,7 @@ def corner_rows(problem: Problem, state: State, *, poses_only: bool = False) -> 
 
     With ``poses_only`` the derivatives are those by the unknowns of each view.
     """
-    derivatives = _CornerDerivatives(problem, state, of_view_only=poses_only)
+    derivatives = _CornerDerivatives(problem, state, poses_only=poses_only)
     left = problem.observed_px - derivatives.jacobians.xy - _drift_shift(problem, state)
     huber = _huber(whitened_norm(problem, left))[1]
     layout = problem.layout.of_view if poses_only else problem.layout.only(_CORNER_DERIVATIVES)
