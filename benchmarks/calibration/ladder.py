@@ -55,8 +55,6 @@ from semcal_ros.core.ladder.extend import LadderResult, extend_calibration
 from semcal_ros.core.ladder.matching import LadderPicture
 from semcal_ros.synthetic.stage import grid_views
 
-__all__ = ["Case", "compare", "draw_case", "record"]
-
 Array = NDArray[np.float64]
 CALIBRATED = (500.0, 1000.0, 2000.0, 3500.0, 6000.0, 10000.0)
 FIRST, STEP = 4400.0, 1.5
@@ -84,11 +82,18 @@ def camera_at(scope: Scope, g: float) -> ScanCamera:
     return ScanCamera(g, *values, scope.width, scope.height)
 
 
-def draw_case(seed: int, size: int, with_relay: bool, squares: float = SQUARES) -> Case:
-    """Draw a microscope and calibrate it by a grid whose squares are off by ``squares`` (1-sigma)."""
+def draw_microscope(
+    seed: int, size: int, with_relay: bool
+) -> tuple[Scope, tuple[float, float] | None, np.random.Generator]:
+    """Draw a microscope; also returns its relay, and the generator for what follows."""
     rng = np.random.default_rng([seed, 35])
     relay = (float(np.exp(rng.uniform(np.log(1.3e4), np.log(7e4)))), 0.005) if with_relay else None
-    scope = draw_scope(rng, size, relay)
+    return draw_scope(rng, size, relay), relay, rng
+
+
+def draw_case(seed: int, size: int, with_relay: bool, squares: float = SQUARES) -> Case:
+    """Draw a microscope and calibrate it by a grid whose squares are off by ``squares`` (1-sigma)."""
+    scope, relay, rng = draw_microscope(seed, size, with_relay)
     # The squares are not what the certificate says.
     stretch = 1.0 + squares * float(rng.normal())
     views = []

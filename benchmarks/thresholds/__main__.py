@@ -78,6 +78,8 @@ ROOMS = {
     "estimator": Room("core.calibration.estimator", "calibration"),
     "judgement": Room("core.calibration.judgement", "calibration"),
     "drift": Room("core.drift", "drift"),
+    "ladder": Room("core.ladder", "ladder"),
+    "cantilever": Room("applications.cantilever", "cantilever"),
 }
 
 
