@@ -79,6 +79,10 @@ ROOMS = {
     "judgement": Room("core.calibration.judgement", "calibration"),
     "drift": Room("core.drift", "drift"),
     "ladder": Room("core.ladder", "ladder"),
+    "rectification": Room("core.rectification", "rectification"),
+    "camera": Room("core.camera", "rectification"),
+    "servoing": Room("applications.servoing", "servoing"),
+    "reconstruction": Room("applications.reconstruction", "reconstruction"),
     "cantilever": Room("applications.cantilever", "cantilever"),
 }
 
