@@ -36,7 +36,9 @@ from semcal_ros.core.calibration.estimator.trust_region import DescentStatus, St
 from semcal_ros.core.camera.plane_geometry import cross_matrices, rotations_from_vectors
 from semcal_ros.core.camera.projection import project_ideal_points
 from semcal_ros.core.camera.scan_camera import ScanCamera
+from semcal_ros.core.errors import StructureError
 from semcal_ros.core.robust_losses import cauchy_loss, cauchy_weight
+from semcal_ros.core.wording import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +269,11 @@ def adjust(
         1-sigma of the heights of the views relative to the reference view, m.
     max_iterations, tolerance
         The iteration ends at this number, or when the cost falls by less than this fraction.
+
+    Raises
+    ------
+    StructureError
+        If the initial values are none that the cameras can show: their relief is larger than the pivot is far away.
     """
     unit_m = float(np.sqrt(np.mean(np.var(points_m, axis=0)))) or 1.0
     problem = _Problem(observations, cameras, unit_m, height_sigma_m, reference)
@@ -280,6 +287,13 @@ def adjust(
     held = np.arange(6 * reference, 6 * reference + 6)
     free = np.setdiff1d(np.arange(6 * len(cameras)), held)
     iterations, converged, sigma = 0, False, _estimate_scale(problem, state)
+    if not np.isfinite(sigma):
+        raise StructureError(
+            f"a first structure of {counted(len(points_m), 'point')} in {counted(len(cameras), 'view')} whose relief "
+            "the cameras cannot show",
+            expected="a specimen whose turns tell its depth",
+            do="record more texture, slower movements or larger turns",
+        )
     for _ in range(3):
         # The robust loss depends on the scale of the residuals: estimate both in turn.
         found = descend(

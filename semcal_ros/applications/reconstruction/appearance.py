@@ -141,6 +141,9 @@ class Shading:
     def evaluate(self, slope: Array) -> Image:
         """Evaluate at X and Y of unit normals, (n, samples, 2) -> (n, samples)."""
         at = ((slope + 1.0) * (0.5 * (len(self.table) - 1))).astype(np.float32)
+        if not at.size:
+            # A view that no point faces: OpenCV refuses an empty picture.
+            return np.zeros(at.shape[:2], dtype=np.float32)
         out = cv2.remap(
             self.table, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )

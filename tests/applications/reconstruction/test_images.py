@@ -174,6 +174,22 @@ def test_a_still_specimen_gives_one_keyframe_and_is_refused():
         reconstruct(keyframes)
 
 
+@pytest.mark.parametrize(
+    ("seed", "frames", "pixel_m", "said"),
+    [
+        # A view that no point faces.
+        (3, 32, 10e-9, "that agree"),
+        # A first structure that is as deep as the pivot is far away.
+        (4, 20, 12e-9, "relief the cameras cannot show"),
+    ],
+)
+def test_a_recording_that_tells_too_little_is_refused(seed, frames, pixel_m, said):
+    made = draw_ball_plan(seed, frames=frames, pixel_m=pixel_m)
+    keyframes = followed(made, TrackerSettings(spacing_px=8.0))
+    with pytest.raises(StructureError, match=said):
+        reconstruct(keyframes, made.microscope.timing)
+
+
 def test_a_shift_is_not_parallax():
     """Drift moves everything alike; it brings nothing new."""
     moved = Turning(40.0, roll_rad=0.0, yaw_rad=0.0, travel_m=(2e-7, 5e-8, 0.0), centre_m=CENTRE_M)
