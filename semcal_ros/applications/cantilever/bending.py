@@ -139,8 +139,14 @@ def fit_common_shape(
         1-sigma of the factor of u^3 that the noise of the reference causes.
     reference_count
         Number of frames in the reference.
+
+    Returns
+    -------
+    What is known before anything is seen, where no frame shows the beam.
     """
     good = [f for f in frames if np.isfinite(f.sigma_m)]
+    if not good:
+        return Shape(*SHAPE_PRIOR)
     d = np.array([f.deflection_m for f in good])
     b = np.array([f.coefficients[3] for f in good])
     spread = np.array([f.covariance for f in good]).reshape(-1, 2, 2)
@@ -153,11 +159,11 @@ def fit_common_shape(
         normal = (rows / variance[:, None]).T @ rows + np.diag(prior)
         right = (rows / variance[:, None]).T @ b + np.array([prior[0] * SHAPE_PRIOR[0], 0.0])
         c = float(np.linalg.solve(normal, right)[0])
-    along = float(np.sum((d - d.mean()) ** 2)) if len(d) > 1 else 0.0
-    single = float(np.median(np.sqrt(spread[:, 0, 0]))) if len(d) else 0.0
+    along = float(np.sum((d - d.mean()) ** 2))
+    single = float(np.median(np.sqrt(spread[:, 0, 0])))
     apart = along > (BENT_SPREAD_MIN * single) ** 2
     excess = _estimate_shared_excess(good, d, reference_count) if apart else 1.0
-    if not apart and len(good):
+    if not apart:
         # Where the errors may be the same in all frames, these know no more than one.
         normal = (rows / (len(good) * variance)[:, None]).T @ rows + np.diag(prior)
     sigma = float(np.sqrt(np.linalg.inv(normal)[0, 0] * excess))

@@ -284,6 +284,15 @@ def test_frames_that_are_bent_alike_know_no_more_of_the_shape_than_one(seed):
     assert apart.sigma < 0.95 * one.sigma
 
 
+def test_frames_that_show_no_beam_leave_the_shape_to_what_is_known_before():
+    """With a reference that shows none either, this once ended in a singular matrix."""
+    u = np.linspace(0.1, 1.0, 4)
+    unseen = fit_bending(u, np.zeros((4, 2)), np.full((4, 2), np.inf), LENGTH, 1e-9)
+    assert unseen.sigma_m == np.inf
+    for frames in ([unseen, unseen], []):
+        assert fit_common_shape(frames, np.inf, 1) == Shape(-0.25, 0.35)
+
+
 def test_a_mean_over_frames_keeps_what_they_share():
     """Four frames of a pose, each with noise of 1 nm and an error of the scale of 1 nm."""
     frame = SimpleNamespace(
