@@ -188,15 +188,15 @@ class _Surface:
         shifts_px: tuple[tuple[float, float], ...],
         noise: float = 3.0,
     ) -> HeightCase:
-        """Pictures of it, tilted and shifted; the one that is tilted least is the reference."""
+        """Pictures of it, tilted and shifted; of three, the middle one is the reference, of two, that tilted less."""
         rng = np.random.default_rng([self.seed, 13])
         seen = [self._look(t, s) for t, s in zip(tilts_rad, shifts_px, strict=True)]
         images = tuple(
             np.clip(np.rint(grey + rng.normal(0.0, noise, grey.shape)), 0, 255).astype(np.uint8)
             for grey, _ in seen
         )
-        height = seen[int(np.argmin(np.abs(tilts_rad)))][1]
-        return HeightCase(images, tilts_rad, PIXEL_M * height)
+        reference = 1 if len(seen) == 3 else int(np.argmin(np.abs(tilts_rad)))
+        return HeightCase(images, tilts_rad, PIXEL_M * seen[reference][1])
 
     def _look(self, tilt_rad: float, shift_px: tuple[float, float]) -> tuple[Floats, Floats]:
         """Grey levels and heights: each ray is followed to where it hits."""
