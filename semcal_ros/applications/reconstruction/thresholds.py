@@ -24,14 +24,19 @@ from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
 
+# Of the measured rows: each says in how many cases it was tried, and what changed in them (doc/thresholds.md).
+TRIED = "python -m benchmarks.thresholds reconstruction, 29 November 2026"
+
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
 # Tracks, in feature_tracks.py
 
-FEATURES_MIN = TABLE.stated(
+FEATURES_MIN = TABLE.measured(
     "FEATURES_MIN", 30, "features",
-    "With fewer left, the whole frame is processed: the others may be anywhere.",
+    "With fewer left, the whole frame is processed: the others may be anywhere. With 45 or 20, nothing changes in 5 "
+    "cases; with a thousand times or a thousandth of it something does.",
+    command=TRIED,
 )
 
 # Pairs of views, in epipolar.py
@@ -47,22 +52,28 @@ WINDOWS = TABLE.cost(
     "WINDOWS", (3, 4, 6, 8, 12, 16, 24, 32, 48), "views",
     "Successive ones that are tried as the first block: short blocks share more points, long ones turn farther.",
 )
-COMMON_MIN = TABLE.stated(
+COMMON_MIN = TABLE.measured(
     "COMMON_MIN", 12, "points",
-    "That all views of a block share: four times the rank, so that the other singular values show the noise.",
+    "That all views of a block share: four times the rank, so that the other singular values show the noise. With 18 "
+    "or 8, nothing changes in 4 cases; with a thousand times or a thousandth of it something does.",
+    command=TRIED,
 )
-VIEW_POINTS_MIN = TABLE.stated(
+VIEW_POINTS_MIN = TABLE.measured(
     "VIEW_POINTS_MIN", 8, "points",
-    "In a view: twice the four unknowns of each row of its camera.",
+    "In a view: twice the four unknowns of each row of its camera. With 12 or 5, nothing changes in 4 cases; with a "
+    "thousand times or a thousandth of it something does.",
+    command=TRIED,
 )
 BLOCK_VIEWS_MIN = TABLE.derived(
     "BLOCK_VIEWS_MIN", 3, "views",
     "Two affine views leave the relief open.",
 )
-HUBER_SIGMAS = TABLE.stated(
+HUBER_SIGMAS = TABLE.measured(
     "HUBER_SIGMAS", 1.5, "sigma",
     "On the norm of a residual: near the 1.345 that is 95 % efficient with one normal deviate. Of normal points, a "
-    "third is beyond and loses weight, exp(-1.5^2 / 2).",
+    "third is beyond and loses weight, exp(-1.5^2 / 2). 1.5 times as large, errors are 4.1 % smaller; as small, "
+    "errors are 6.9 % larger.",
+    command=TRIED,
 )
 DEPTH_LEVER_MIN = TABLE.stated(
     "DEPTH_LEVER_MIN", 1e-3, "of that across the view",
@@ -101,21 +112,27 @@ LIMB_TERMS = TABLE.stated(
     "With the logarithm of the cosine and its inverse, all powers between them were seen to be reached within a per "
     "cent up to 70 degrees.",
 )
-COSINE2_MIN = TABLE.stated(
+COSINE2_MIN = TABLE.measured(
     "COSINE2_MIN", 0.01, "squared cosine",
-    "At 84 degrees: the limb is not steeper than the beam spot lets it be.",
+    "At 84 degrees: the limb is not steeper than the beam spot lets it be. 1.5 times as large, errors change by less "
+    "than 0.1 %; as small, errors are 5 % larger.",
+    command=TRIED,
 )
 SHADING_OUTLIER = TABLE.stated(
     "SHADING_OUTLIER", 2.5, "median error",
     "From which a patch shows something else, an edge or the tip.",
 )
-SHADING_NODES = TABLE.stated(
+SHADING_NODES = TABLE.measured(
     "SHADING_NODES", 257, "nodes",
-    "Along X and Y: linear interpolation was seen to be right to 1e-4 of the range of the cosine.",
+    "Along X and Y: linear interpolation was seen to be right to 1e-4 of the range of the cosine. With 386 or 171, 4 "
+    "cases are decided alike, and errors change by 2.1 % at most.",
+    command=TRIED,
 )
-SHADING_CONDITION = TABLE.stated(
+SHADING_CONDITION = TABLE.measured(
     "SHADING_CONDITION", 1e-4, "of the largest singular value",
-    "Directions of the coefficients that the views determine less stay zero.",
+    "Directions of the coefficients that the views determine less stay zero. 1.5 times as large or as small, it "
+    "changes nothing in 4 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # Patches, in patches.py
@@ -171,18 +188,24 @@ SURFACE_POINTS_MIN = TABLE.derived(
 
 # A ball or not, in ball.py
 
-OFF_SPHERE = TABLE.stated(
+OFF_SPHERE = TABLE.measured(
     "OFF_SPHERE", 0.2, "of the radius",
-    "Points farther off belong to what holds the ball.",
+    "Points farther off belong to what holds the ball. 1.5 times as large or as small, it changes nothing in 3 cases; "
+    "a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-NECK_RAD = TABLE.stated(
+NECK_RAD = TABLE.measured(
     "NECK_RAD", 0.35, "rad",
-    "About such points, within which others are left out: the neck of the tip.",
+    "About such points, within which others are left out: the neck of the tip. 1.5 times as large or as small, it "
+    "changes nothing in 3 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-BUMP_RAD = TABLE.stated(
+BUMP_RAD = TABLE.measured(
     "BUMP_RAD", 0.2, "rad",
-    "1-sigma of a window. A bump as wide as it shows most clearly; narrower ones, or with a few points in them, "
-    "show noise.",
+    "1-sigma of a window. A bump as wide as it shows most clearly; narrower ones, or with a few points in them, show "
+    "noise. 1.5 times as large or as small, it changes nothing in 3 cases; a thousand times or a thousandth of it "
+    "does.",
+    command=TRIED,
 )
 BUMP_POINTS_MIN = TABLE.stated(
     "BUMP_POINTS_MIN", 5.0, "points",
@@ -211,10 +234,11 @@ JACKKNIFE_FALSE_ALARMS = TABLE.defined(
     "JACKKNIFE_FALSE_ALARMS", 0.05, "chance",
     "With which the jackknife, of few degrees of freedom, counts instead of the noise that is predicted.",
 )
-PATCH_GROUPS = TABLE.stated(
+PATCH_GROUPS = TABLE.measured(
     "PATCH_GROUPS", 16, "groups",
-    "Of neighbouring patches, that are left out in turn: each holds many patches, and fifteen degrees of freedom "
-    "tell a sigma to 18 %.",
+    "Of neighbouring patches, that are left out in turn: each holds many patches, and fifteen degrees of freedom tell "
+    "a sigma to 18 %. With 24 or 11, 3 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 
 # Pairs of tilted pictures, in tilt_series.py
@@ -224,43 +248,60 @@ DESCRIPTOR_RATIO = TABLE.derived(
     "Of the distances of the best and the second best descriptor (Lowe 2004, section 7.1, "
     "doi:10.1023/B:VISI.0000029664.99615.94).",
 )
-MATCH_TOLERANCE_PX = TABLE.stated(
+MATCH_TOLERANCE_PX = TABLE.measured(
     "MATCH_TOLERANCE_PX", 2.0, "px",
-    "Three times the 0.7 px that a SIFT feature of a coarser octave is uncertain by.",
+    "Three times the 0.7 px that a SIFT feature of a coarser octave is uncertain by. 1.5 times as large or as small, "
+    "10 cases are decided alike, and errors change by 0.74 % at most.",
+    command=TRIED,
 )
-MATCH_NEIGHBOURS = TABLE.stated(
+MATCH_NEIGHBOURS = TABLE.measured(
     "MATCH_NEIGHBOURS", 8, "matches",
-    "That a match is compared with: enough for a median that one wrong match among them does not move.",
+    "That a match is compared with: enough for a median that one wrong match among them does not move. With 12 or 5, "
+    "nothing changes in 9 cases; with a thousand times or a thousandth of it something does.",
+    command=TRIED,
 )
-NEIGHBOUR_SIGMAS = TABLE.stated(
+NEIGHBOUR_SIGMAS = TABLE.measured(
     "NEIGHBOUR_SIGMAS", 6.0, "robust sigmas",
     "By which it may be shifted against them: relief is steeper in places than its spread tells, so that no rate is "
-    "known.",
+    "known. 1.5 times as large or as small, it changes nothing in 9 cases; a thousand times or a thousandth of it "
+    "does.",
+    command=TRIED,
 )
-MATCHES_MIN = TABLE.stated(
+MATCHES_MIN = TABLE.measured(
     "MATCHES_MIN", 20, "matches",
-    "Fewer leave the axis to a handful of places of the specimen.",
+    "Fewer leave the axis to a handful of places of the specimen. With 30 or 13, 10 cases are decided alike, and "
+    "errors change by less than 0.1 %.",
+    command=TRIED,
 )
-OVERLAP_MIN = TABLE.stated(
+OVERLAP_MIN = TABLE.measured(
     "OVERLAP_MIN", 0.2, "of the picture",
-    "That the other has to show. With less, the axis comes from a strip along one edge: at a tenth it was seen to "
-    "be off by three of its sigmas, at a quarter not.",
+    "That the other has to show. With less, the axis comes from a strip along one edge: at a tenth it was seen to be "
+    "off by three of its sigmas, at a quarter not. 1.5 times as large, 1 of 10 cases is decided otherwise and there "
+    "are 4.9 % fewer points or frames; as small, errors change by less than 0.1 %.",
+    command=TRIED,
 )
 OVERLAP_MATCHES = TABLE.derived(
     "OVERLAP_MATCHES", 5, "matches",
     "From which an overlap is computed: an affine map needs three, and two more test it.",
 )
-PARALLAX_MAX = TABLE.stated(
+PARALLAX_MAX = TABLE.measured(
     "PARALLAX_MAX", 0.05, "of the width",
-    "RMS, beyond which matches are wrong: relief of a tenth of the field at 30 degrees makes a twentieth.",
+    "RMS, beyond which matches are wrong: relief of a tenth of the field at 30 degrees makes a twentieth. 1.5 times "
+    "as large or as small, it changes nothing in 10 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-MATCHES_PART_MIN = TABLE.stated(
+MATCHES_PART_MIN = TABLE.measured(
     "MATCHES_PART_MIN", 0.25, "of the matches",
-    "A pair of pictures of which fewer agree is not described by one parallel projection.",
+    "A pair of pictures of which fewer agree is not described by one parallel projection. 1.5 times as large or as "
+    "small, it changes nothing in 10 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-PARALLAX_MIN = TABLE.stated(
+PARALLAX_MIN = TABLE.measured(
     "PARALLAX_MIN", 2.0, "noise",
-    "Of the matches, that the parallax has to exceed, or the axis is a fit of noise.",
+    "Of the matches, that the parallax has to exceed, or the axis is a fit of noise. 1.5 times as large, 1 of 10 "
+    "cases is decided otherwise and there are 18 % fewer points or frames; as small, 1 of 10 cases is decided "
+    "otherwise.",
+    command=TRIED,
 )
 GREY_WINDOW_PX = TABLE.stated(
     "GREY_WINDOW_PX", 2.5, "px",
@@ -284,28 +325,36 @@ GREY_CORRELATION_MIN = TABLE.derived(
     "GREY_CORRELATION_MIN", 0.7, "correlation",
     "Of grey levels that are compared: half of their variance is common.",
 )
-DISPARITY_AGREEMENT_PX = TABLE.stated(
+DISPARITY_AGREEMENT_PX = TABLE.measured(
     "DISPARITY_AGREEMENT_PX", 1.0, "px",
-    "Between the disparities from either side: the step of the search.",
+    "Between the disparities from either side: the step of the search. 1.5 times as large or as small, 6 cases are "
+    "decided alike, and errors change by 2.2 % at most.",
+    command=TRIED,
 )
 
 # Series of tilts, in tilt_series.py
 
-TILT_STEP_MIN_RAD = TABLE.stated(
+TILT_STEP_MIN_RAD = TABLE.measured(
     "TILT_STEP_MIN_RAD", math.radians(0.5), "rad",
-    "Between two pictures: at 0.5 degrees an error of 0.1 px is one of 11 px in height.",
+    "Between two pictures: at 0.5 degrees an error of 0.1 px is one of 11 px in height. 1.5 times as large or as "
+    "small, 11 cases are decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
-TILT_STEP_MAX_RAD = TABLE.stated(
+TILT_STEP_MAX_RAD = TABLE.measured(
     "TILT_STEP_MAX_RAD", math.radians(45.0), "rad",
-    "Beyond it, pictures of rough surfaces hide too much of each other.",
+    "Beyond it, pictures of rough surfaces hide too much of each other. 1.5 times as large or as small, 11 cases are "
+    "decided alike, and errors change by less than 0.1 %.",
+    command=TRIED,
 )
 AXIS_DOUBT_RAD = TABLE.derived(
     "AXIS_DOUBT_RAD", math.radians(45.0), "rad",
     "From the expected axis: farther off, it could be the expected one in either sense.",
 )
-COVERAGE_MIN = TABLE.stated(
+COVERAGE_MIN = TABLE.measured(
     "COVERAGE_MIN", 0.02, "of the picture",
-    "That has to have a height, or the map says nothing about the specimen.",
+    "That has to have a height, or the map says nothing about the specimen. 1.5 times as large or as small, it "
+    "changes nothing in 6 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 CONTRADICTION_SIGMAS = TABLE.derived(
     "CONTRADICTION_SIGMAS", 4.0, "sigma",

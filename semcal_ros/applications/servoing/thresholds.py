@@ -20,6 +20,9 @@ from semcal_ros.core.thresholds import Table
 
 TABLE = Table()
 
+# Of the measured rows: each says in how many cases it was tried, and what changed in them (doc/thresholds.md).
+TRIED = "python -m benchmarks.thresholds servoing, 29 November 2026"
+
 # A row takes three lines, and not one for each of its parts.
 # fmt: off
 
@@ -29,9 +32,10 @@ RATIO = TABLE.defined(
     "RATIO", 3, "ratio",
     "Of the cells of one level to those of the next: the middle cell of 3 x 3 holds the next board.",
 )
-MARKER_SIDE = TABLE.stated(
+MARKER_SIDE = TABLE.defined(
     "MARKER_SIDE", 0.7, "of a cell",
-    "Of a marker. It leaves a white border of 0.15 of a cell, wider than one square of the marker, 0.7 / 6 = 0.12.",
+    "Of a marker: it is a part of what the target is. It leaves a white border of 0.15 of a cell, wider than one "
+    "square of the marker, 0.7 / 6 = 0.12.",
 )
 MARKER_BITS = TABLE.defined(
     "MARKER_BITS", 6, "squares",
@@ -57,17 +61,23 @@ SEARCH_BLUR_PX = TABLE.stated(
     "SEARCH_BLUR_PX", 1.0, "px",
     "Sigma of the smoothing for the search: a third of the smallest square that can be read.",
 )
-SIDE_ENDS = TABLE.stated(
+SIDE_ENDS = TABLE.measured(
     "SIDE_ENDS", 0.14, "of a side",
-    "That is left out at each end, where the window would meet the next side.",
+    "That is left out at each end, where the window would meet the next side. 1.5 times as large, errors are 12 % "
+    "larger and errors over sigma 7.2 % larger; as small, errors are 0.88 % smaller.",
+    command=TRIED,
 )
-WINDOW = TABLE.stated(
+WINDOW = TABLE.measured(
     "WINDOW", 0.11, "of a side",
-    "Half width of the window across it; border and frame of a marker are wider.",
+    "Half width of the window across it; border and frame of a marker are wider. 1.5 times as large, errors are 46 % "
+    "larger and errors over sigma 24 % smaller; as small, errors are 13 % larger and errors over sigma 28 % larger.",
+    command=TRIED,
 )
-WINDOW_MIN_PX = TABLE.stated(
+WINDOW_MIN_PX = TABLE.measured(
     "WINDOW_MIN_PX", 2.0, "px",
-    "Of that half width: an edge has to lie in it with its blur.",
+    "Of that half width: an edge has to lie in it with its blur. 1.5 times as large, errors are 7.3 % larger and "
+    "those of one case 40 % larger; as small, errors change by less than 0.1 %.",
+    command=TRIED,
 )
 WINDOW_MAX_PX = TABLE.cost(
     "WINDOW_MAX_PX", 6.0, "px",
@@ -77,9 +87,11 @@ WINDOW_ROUNDS = TABLE.cost(
     "WINDOW_ROUNDS", 4, "rounds",
     "In which the windows are laid over the corners found last.",
 )
-SETTLED_PX = TABLE.stated(
+SETTLED_PX = TABLE.measured(
     "SETTLED_PX", 0.02, "px",
-    "Movement of the corners after which that ends: what they are uncertain by at best.",
+    "Movement of the corners after which that ends: what they are uncertain by at best. 1.5 times as large or as "
+    "small, 7 cases are decided alike, and errors change by 0.28 % at most.",
+    command=TRIED,
 )
 PLACES_MAX = TABLE.cost(
     "PLACES_MAX", 96, "places",
@@ -89,17 +101,23 @@ STEP_SIGMAS = TABLE.derived(
     "STEP_SIGMAS", 3.5, "sigma",
     "From the line through the others, beyond which a step is dust: by chance one of 2100 (normal, both sides).",
 )
-RAGGED_PART = TABLE.stated(
+RAGGED_PART = TABLE.measured(
     "RAGGED_PART", 0.5, "of the window",
-    "Steps that scatter by more do not form a line.",
+    "Steps that scatter by more do not form a line. 1.5 times as large or as small, 7 cases are decided alike, and "
+    "errors change by 2.1 % at most.",
+    command=TRIED,
 )
-CONTRAST_MIN = TABLE.stated(
+CONTRAST_MIN = TABLE.measured(
     "CONTRAST_MIN", 2.0, "sigma",
-    "Of a side, in standard deviations of its pixels from the two levels.",
+    "Of a side, in standard deviations of its pixels from the two levels. 1.5 times as large or as small, 7 cases are "
+    "decided alike, and errors change by 2.2 % at most.",
+    command=TRIED,
 )
-PLACES_MIN = TABLE.stated(
+PLACES_MIN = TABLE.measured(
     "PLACES_MIN", 6, "places",
-    "On a side, also after outliers were left out: three for each unknown.",
+    "On a side, also after outliers were left out: three for each unknown. With 9 or 4, nothing changes in 7 cases; "
+    "with a thousand times or a thousandth of it something does.",
+    command=TRIED,
 )
 
 # The pose of the target, in pose.py
@@ -112,9 +130,11 @@ POSE_SETTLED_PX = TABLE.derived(
     "POSE_SETTLED_PX", 1e-6, "px",
     "Movement of the corners in the last step: far below their errors, some hundredths of a pixel.",
 )
-MISREAD_PART = TABLE.stated(
+MISREAD_PART = TABLE.measured(
     "MISREAD_PART", 0.25, "of a side",
-    "From its expected position, from which a marker was misread.",
+    "From its expected position, from which a marker was misread. 1.5 times as large or as small, it changes nothing "
+    "in 21 cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
 
 # The camera, in plane_camera.py
@@ -127,14 +147,18 @@ SAME_MATRIX = TABLE.derived(
 
 # The axis of the zoom, in plane_camera.py
 
-SAME_SCALE = TABLE.stated(
+SAME_SCALE = TABLE.measured(
     "SAME_SCALE", 0.002, "of the scale",
     "Scales that differ by less are of one magnification: if the cameras still differ, another calibration has come "
-    "into force.",
+    "into force. 1.5 times as large or as small, it changes nothing in 9 cases; a thousand times or a thousandth of "
+    "it does.",
+    command=TRIED,
 )
-SCALE_SIGMA = TABLE.stated(
+SCALE_SIGMA = TABLE.measured(
     "SCALE_SIGMA", 0.003, "of the scale",
-    "1-sigma of a camera's: it also moves points that are off the axis.",
+    "1-sigma of a camera's: it also moves points that are off the axis. 1.5 times as large, errors are 2.9 % smaller "
+    "and those of one case 39 % larger; as small, errors are 3.3 % larger.",
+    command=TRIED,
 )
 
 # Commands and drift, in motion.py
@@ -147,25 +171,33 @@ GATE_SIGMAS = TABLE.derived(
     "GATE_SIGMAS", 5.0, "sigma",
     "Of an innovation that is not drift: by chance one of 870 000 frames (normal, both sides, two axes).",
 )
-ODD_MAX = TABLE.stated(
+ODD_MAX = TABLE.measured(
     "ODD_MAX", 4, "frames",
-    "In a row beyond the gate, that are drift after all.",
+    "In a row beyond the gate, that are drift after all. With 6 or 3, nothing changes in 12 cases; with a thousand "
+    "times or a thousandth of it something does.",
+    command=TRIED,
 )
 DRIFT_FACTOR = TABLE.stated(
     "DRIFT_FACTOR", 10.0, "ratio",
     "On the expected drift in that case.",
 )
-JUDGED_PX = TABLE.stated(
+JUDGED_PX = TABLE.measured(
     "JUDGED_PX", 36.0, "px",
-    "Commanded travel after which the stage is judged: well above drift and noise in that time.",
+    "Commanded travel after which the stage is judged: well above drift and noise in that time. 1.5 times as large, 1 "
+    "of 12 cases is decided otherwise; as small, 2 of 12 cases are decided otherwise.",
+    command=TRIED,
 )
-TRAVEL_MIN = TABLE.stated(
+TRAVEL_MIN = TABLE.measured(
     "TRAVEL_MIN", 0.3, "of the command",
-    "That has to be seen of it.",
+    "That has to be seen of it. 1.5 times as large or as small, it changes nothing in 12 cases; a thousand times or a "
+    "thousandth of it does.",
+    command=TRIED,
 )
-TRAVEL_MAX = TABLE.stated(
+TRAVEL_MAX = TABLE.measured(
     "TRAVEL_MAX", 3.0, "of the command",
-    "And at most.",
+    "And at most. 1.5 times as large or as small, it changes nothing in 12 cases; a thousand times or a thousandth of "
+    "it does.",
+    command=TRIED,
 )
 
 # The control law, in law.py
@@ -180,11 +212,16 @@ GAIN_WITHOUT_TIMES_MAX = TABLE.derived(
     "Without times the latency cannot be predicted; a quarter does not overshoot with one frame of it, as 1 / 4 is "
     "where both roots of z^2 - z + k are real.",
 )
-LATENCY_MAX_S = TABLE.stated(
+LATENCY_MAX_S = TABLE.measured(
     "LATENCY_MAX_S", 30.0, "s",
-    "Frames and commands of one clock are not farther apart.",
+    "Frames and commands of one clock are not farther apart. 1.5 times as large or as small, it changes nothing in 12 "
+    "cases; a thousand times or a thousandth of it does.",
+    command=TRIED,
 )
-COMMAND_DELAY = TABLE.stated(
+COMMAND_DELAY = TABLE.measured(
     "COMMAND_DELAY", 0.5, "frames",
-    "1-sigma of the delay with which a stage obeys a command.",
+    "1-sigma of the delay with which a stage obeys a command. 1.5 times as large, 1 of 12 cases is decided otherwise, "
+    "errors are 7 % larger and those of one case 35 % larger; as small, 1 of 12 cases is decided otherwise, errors "
+    "are 5.4 % larger and those of one case 73 % larger.",
+    command=TRIED,
 )
