@@ -187,6 +187,9 @@ def _collect_observations(path: DriftPath) -> _Observations:
         index_at[update.time_s] = k
         if index is None or not _has_shear(update):
             continue
+        if not (_knows_velocity(update) and _knows_velocity(path[index])):
+            # A frame before which tracking began anew, and after which nothing was measured.
+            continue
         mean = means.setdefault(index, _KeyframeMean(index, len(means), [path[index].velocity_m_s]))
         rows.append(_observe(path, update, mean))
         if update.merged:
@@ -217,6 +220,10 @@ def _flatten_noise(observed: _Observations) -> _Observations:
 def _has_shear(update: DriftUpdate) -> bool:
     finite = np.all(np.isfinite(update.shear_px)) and np.all(np.isfinite(update.shear_covariance))
     return bool(update.accepted and finite)
+
+
+def _knows_velocity(update: DriftUpdate) -> bool:
+    return bool(np.all(np.isfinite(update.covariance[2:, 2:])))
 
 
 def _observe(path: DriftPath, update: DriftUpdate, mean: _KeyframeMean) -> tuple[Array | int, ...]:

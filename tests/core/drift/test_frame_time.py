@@ -156,10 +156,12 @@ def test_frames_that_are_refused_or_have_no_keyframe_do_not_count() -> None:
     bad: dict[int, dict[str, Any]] = {4: {"rejection": refused}}
     bad[9] = {"keyframe_time_s": float("nan")}
     bad[15] = {"shear_covariance": np.full((2, 2), np.inf)}
+    # Tracking began anew, and nothing was measured since.
+    bad[23] = {"covariance": np.diag([1e-18, 1e-18, np.inf, np.inf])}
     for k, changes in bad.items():
         stream.updates[k] = replace(stream.updates[k], **changes)
     after = stream.estimate()
-    assert (before.frames, after.frames) == (59, 56)
+    assert (before.frames, after.frames) == (59, 55)
     assert after.frame_time_s == pytest.approx(before.frame_time_s, abs=before.sigma_s)
 
 
