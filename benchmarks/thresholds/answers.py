@@ -60,6 +60,13 @@ class Answer:
     seconds: float = 0.0
 
 
+def refusal(error: Exception, seconds: float) -> Answer:
+    """What was refused, with its reason; the numbers in that are no part of the decision."""
+    said = str(error)
+    words = " ".join(word for word in said.split() if word.isalpha())[:60]
+    return Answer(f"refused: {words}", digest=digest_of(said), seconds=seconds)
+
+
 def digest_of(*values: object) -> str:
     """Bits of numbers and arrays, in short."""
     found = hashlib.sha1(usedforsecurity=False)

@@ -20,6 +20,7 @@ Errors are those of the deflection, in nm; the frames at rest are no part of the
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from benchmarks.thresholds.answers import Answer, digest_of
+from benchmarks.thresholds.answers import Answer, digest_of, refusal
 from semcal_ros.applications.cantilever import SeriesSettings, compare_series, measure_series
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -106,7 +107,7 @@ def draw() -> dict[str, Any]:
             seed=seed,
         )
         cases[f"drawn {seed}"] = _take(plan, length_m=drawn.scene.length_m)
-    cases["two beams"] = _paint_two()
+    cases["two beams"] = _take_two()
     end = cases["end"]
     cases["wrong shape"] = replace(end, settings=SeriesSettings(LENGTH_M, "parabola"))
     cases["too short"] = replace(end, settings=SeriesSettings(0.2 * LENGTH_M))
@@ -142,13 +143,13 @@ def _take(
     )
 
 
-def _paint_two() -> Drawn:
-    """Two parallel beams alike, of which the lower one bends as one that is pushed at its end."""
+def paint_two_beams(pushes_px: Sequence[float]) -> list[NDArray[np.uint8]]:
+    """Two parallel beams alike in 256 px, of which the lower one bends as one that is pushed at its end."""
     ground = gaussian_filter(np.random.default_rng(9).normal(0.0, 1.0, (256, 256)), 2.0)
     rows, columns = np.mgrid[:256, :256].astype(float)
     u = np.clip((columns - 39.5) / PAINTED_LENGTH_PX, 0.0, 1.0)
     frames = []
-    for number, push in enumerate(PAINTED_PUSHES_PX):
+    for number, push in enumerate(pushes_px):
         image = 60.0 + 30.0 * ground
         for row, bent in ((80.0, 0.0), (150.0, push)):
             across = np.abs(rows - row - bent * 0.5 * (3.0 * u**2 - u**3))
@@ -157,6 +158,11 @@ def _paint_two() -> Drawn:
         image = image + ndtr(39.5 - columns) * (160.0 - image)
         noise = np.random.default_rng(number).normal(0.0, 5.0, image.shape)
         frames.append(np.clip(image + noise, 0, 255).astype(np.uint8))
+    return frames
+
+
+def _take_two() -> Drawn:
+    frames = paint_two_beams(PAINTED_PUSHES_PX)
     camera = ScanCamera.nominal(6450.0, 256, 256, 6450.0 * 256 * PAINTED_PX_M)
     return Drawn(
         frames,
@@ -182,11 +188,7 @@ def run(case: Drawn) -> Answer:
         )
         table = compare_series([found], poses=len(case.frames) // len(case.reference))
     except SemcalError as error:
-        said = str(error)
-        # The reason has numbers.
-        words = " ".join(word for word in said.split() if word.isalpha())[:60]
-        seconds = time.process_time() - start
-        return Answer(f"refused: {words}", digest=digest_of(said), seconds=seconds)
+        return refusal(error, time.process_time() - start)
     seconds = time.process_time() - start
     measured = np.array([frame.deflection_m for frame in found.frames])
     sigma = np.array([frame.sigma_m for frame in found.frames])

@@ -41,7 +41,7 @@ from benchmarks.calibration.ladder import (
     draw_microscope,
     record,
 )
-from benchmarks.thresholds.answers import Answer, digest_of
+from benchmarks.thresholds.answers import Answer, digest_of, refusal
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.errors import SemcalError
 from semcal_ros.core.ladder import acquisition
@@ -216,11 +216,7 @@ def run(case: Drawn) -> Answer:
     try:
         return _ACTIONS[case.action](case, start)
     except SemcalError as error:
-        said = str(error)
-        # The reason has numbers.
-        words = " ".join(word for word in said.split() if word.isalpha())[:60]
-        seconds = time.process_time() - start
-        return Answer(f"refused: {words}", digest=digest_of(said), seconds=seconds)
+        return refusal(error, time.process_time() - start)
 
 
 def _extend(case: Drawn, start: float) -> Answer:

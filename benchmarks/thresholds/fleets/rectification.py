@@ -96,14 +96,17 @@ def draw() -> dict[str, Any]:
         drift = _drift_px(plain, motion)
         cases[f"plain, {name}"] = _expect([plain], [drift])
         cases[f"settling, {name}"] = _expect([settling], [drift])
-        field = _make_field(2.0)
+        field = make_settling_field(SIZE, 2.0)
         cases[f"field, {name}"] = _expect([replace(plain, residual=field.at(G))], [drift])
-    both = replace(settling, residual=_make_field(1.0).at(G))
+    both = replace(settling, residual=make_settling_field(SIZE, 1.0).at(G))
     cases["settling and field"] = _expect([both], [_drift_px(plain, DRIFTS["slow"])])
-    steep = replace(plain, residual=_make_field(20.0).at(G))
+    steep = replace(plain, residual=make_settling_field(SIZE, 20.0).at(G))
     cases["a steep field"] = _expect([steep], [None])
     zoom = [
-        replace(preset("pincushion").camera_at(g).resized(*SIZE), residual=_make_field(2.0).at(g))
+        replace(
+            preset("pincushion").camera_at(g).resized(*SIZE),
+            residual=make_settling_field(SIZE, 2.0).at(g),
+        )
         for g in (300.0, 320.0, 340.0, 2000.0, 320.0, 8000.0)
     ]
     starts = [_drift_px(plain, ((x, 0.5), (0.1 * x, 0.0), (0.0, 0.0))) for x in (0.0, 1.0, 30.0)]
@@ -143,16 +146,16 @@ def _drift_px(camera: ScanCamera, motion: Any) -> RasterDrift | None:
     return None if motion is None else RasterDrift(*(np.array(v) / camera.m for v in motion))
 
 
-def _make_field(strength_px: float) -> ResidualField:
+def make_settling_field(size: tuple[int, int], strength_px: float) -> ResidualField:
     """A beam that settles at the start of the lines, and a bend, changing with the magnification."""
-    zero = zero_field(SIZE, (100.0, 10000.0), 3)
+    zero = zero_field(size, (100.0, 10000.0), 3)
     coefficients = zero.coefficients.copy()
     # Near enough to where each basis function has its maximum.
     x, y = (
         np.array([np.mean(knots[k + 1 : k + 4]) for k in range(len(knots) - 4)])
         for knots in (zero.knots_x, zero.knots_y)
     )
-    amplitude = strength_px / (0.5 * SIZE[0]) * np.array([1.0, 1.3, 0.6])[:, None, None]
+    amplitude = strength_px / (0.5 * size[0]) * np.array([1.0, 1.3, 0.6])[:, None, None]
     coefficients[..., 0] = amplitude * (np.exp(-(x + 1.0) / 0.15) + 0.5 * np.sin(3.0 * y)[:, None])
     coefficients[..., 1] = amplitude * 0.5 * np.sin(3.0 * x) * np.cos(2.0 * y)[:, None]
     return replace(zero, coefficients=coefficients)

@@ -24,6 +24,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
+from benchmarks.thresholds.fleets.cantilever import (
+    PAINTED_LENGTH_PX,
+    PAINTED_PX_M,
+    paint_two_beams,
+)
 from semcal_ros.applications.cantilever import (
     SeriesSettings,
     compare_series,
@@ -459,23 +464,10 @@ def test_what_moves_along_itself_is_no_clamped_beam():
 @pytest.mark.long
 def test_of_two_parallel_beams_the_one_that_bends_is_measured():
     """Both are alike, at 100 nm per pixel; the lower one bends as a beam that is pushed at its end."""
-    pixel_m, length = 100e-9, 150
+    pixel_m, length = PAINTED_PX_M, PAINTED_LENGTH_PX
     camera = replace(scope(256, name="ideal").camera_at(6450.0), m=1.0 / pixel_m)
     truth_px = np.array([0.0, 1.0, 2.5, 4.0])
-    ground = gaussian_filter(np.random.default_rng(9).normal(0.0, 1.0, (256, 256)), 2.0)
-    rows, columns = np.mgrid[:256, :256].astype(float)
-    u = np.clip((columns - 39.5) / length, 0.0, 1.0)
-    images = []
-    for number, push in enumerate(truth_px):
-        image = 60.0 + 30.0 * ground
-        for row, bent in ((80.0, 0.0), (150.0, push)):
-            across = np.abs(rows - row - bent * 0.5 * (3.0 * u**2 - u**3))
-            cover = ndtr(9.0 - across) * ndtr(39.5 + length - columns)
-            image = image + cover * (160.0 - image)
-        holder = ndtr(39.5 - columns)
-        image = image + holder * (160.0 - image)
-        noise = np.random.default_rng(number).normal(0.0, 5.0, image.shape)
-        images.append(np.clip(image + noise, 0, 255).astype(np.uint8))
+    images = paint_two_beams(truth_px)
     settings = SeriesSettings(length * pixel_m)
     found = measure_series(images, [0.0, 5.0, 10.0, 15.0], camera, None, settings)
     assert any("the one that bends was measured" in note for note in found.notes)

@@ -16,11 +16,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates, spline_filter
 
+from benchmarks.thresholds.fleets.reconstruction import AXIS_RAD, RoughSurface, expose
 from semcal_ros.applications.reconstruction import tilt_series
 from semcal_ros.applications.reconstruction.tilt_series import (
     HeightMap,
@@ -32,67 +31,32 @@ from semcal_ros.core.errors import InvalidValueError, StructureError
 
 _SIDE = 240
 _PIXEL_M = 50e-9
-_AXIS_RAD = np.radians(12.0)
 _TILTS_RAD = tuple(np.radians((-7.0, 0.0, 7.0)))
 _TILT_SIGMA_RAD = 1e-6
 
 
-def _smooth(rng: np.random.Generator, sigma: float, side: int) -> Array:
-    field = cv2.GaussianBlur(rng.standard_normal((side, side)), (0, 0), sigma)
-    return np.asarray(field / field.std())
+def _surface(seed: int, rms_px: float = 6.0) -> RoughSurface:
+    return RoughSurface(np.random.default_rng(seed), _SIDE, rms_px)
 
 
-class _Specimen:
-    """Rough surface z(x, y) on a grid of pixels, with a texture that is painted on it."""
-
-    def __init__(self, seed: int, rms_px: float = 6.0) -> None:
-        rng = np.random.default_rng(seed)
-        side = _SIDE + 120
-        # Coefficients of splines. OpenCV's cubic kernel shifts what it shows by up to 0.05 px, which follows the relief
-        # as parallax does: the axis was off by three of its sigmas for that alone.
-        self.height = spline_filter(rms_px * _smooth(rng, 22.0, side))
-        self.texture = spline_filter(sum(_smooth(rng, s, side) for s in (1.2, 2.5, 6.0)))
-        self._middle = 0.5 * (side - 1)
-
-    def _look_up(self, field: Array, x: Array, y: Array) -> Array:
-        at = [y + self._middle, x + self._middle]
-        return np.asarray(map_coordinates(field, at, order=3, prefilter=False, mode="nearest"))
-
-    def see(
-        self, tilt_rad: float, *, seed: int, noise: float = 3.0, shift: tuple[float, float] = (0, 0)
-    ) -> tuple[Array, Array]:
-        """Return grey levels and the height seen by each pixel."""
-        grey, height = self.look(tilt_rad, shift)
-        return _expose(grey, seed, noise), height
-
-    def look(self, tilt_rad: float, shift: tuple[float, float] = (0, 0)) -> tuple[Array, Array]:
-        """Without noise: each ray is followed to where it hits."""
-        rows, columns = np.indices((_SIDE, _SIDE), dtype=np.float64)
-        x, y = (
-            part - 0.5 * (_SIDE - 1) - s for part, s in zip((columns, rows), shift, strict=True)
-        )
-        c, s = np.cos(_AXIS_RAD), np.sin(_AXIS_RAD)
-        u, v = c * x + s * y, c * y - s * x
-        height = np.zeros_like(u)
-        # Slopes of a quarter times the tilt: each step leaves a thirtieth of the error.
-        for _ in range(8):
-            across = (v - height * np.sin(tilt_rad)) / np.cos(tilt_rad)
-            height = self._look_up(self.height, c * u - s * across, s * u + c * across)
-        grey = 120.0 + 25.0 * self._look_up(self.texture, c * u - s * across, s * u + c * across)
-        return grey, height
+def _expose(grey: Array, seed: int) -> Array:
+    return expose(grey, np.random.default_rng(seed))
 
 
-def _expose(grey: Array, seed: int, noise: float = 3.0) -> Array:
-    noisy = grey + np.random.default_rng(seed).normal(0.0, noise, grey.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+def _see(
+    surface: RoughSurface, tilt_rad: float, *, seed: int, shift: tuple[float, float] = (0, 0)
+) -> tuple[Array, Array]:
+    """Return a picture with noise, and the height seen by each pixel."""
+    grey, height = surface.look(tilt_rad, shift)
+    return _expose(grey, seed), height
 
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[list[Array], Array]:
-    specimen = _Specimen(1)
+    specimen = _surface(1)
     shifts = ((3.3, -5.1), (0.0, 0.0), (-2.2, 4.7))
     seen = [
-        specimen.see(t, seed=i, shift=s)
+        _see(specimen, t, seed=i, shift=s)
         for i, (t, s) in enumerate(zip(_TILTS_RAD, shifts, strict=True))
     ]
     return [image for image, _ in seen], seen[1][1]
@@ -161,15 +125,15 @@ def test_pictures_that_allow_no_heights_are_refused(
     if change == "axis":
         axis = np.pi / 2.0
     if change == "other specimen":
-        images = [images[1], _Specimen(9).see(0.1, seed=0)[0]]
+        images = [images[1], _see(_surface(9), 0.1, seed=0)[0]]
         tilts = [0.0, 0.1]
     if change == "contrast":
         images, tilts = [images[1], 255 - images[2]], [0.0, 0.1]
     if change == "same":
         images, tilts = [images[1], images[1]], [0.0, 0.12]
     if change == "flat":
-        flat = _Specimen(3, rms_px=0.0)
-        images, tilts = [flat.see(t, seed=7)[0] for t in (0.0, 0.12)], [0.0, 0.12]
+        flat = _surface(3, rms_px=0.0)
+        images, tilts = [_see(flat, t, seed=7)[0] for t in (0.0, 0.12)], [0.0, 0.12]
     with pytest.raises(StructureError, match=reason):
         measure_heights(images, tilts, _PIXEL_M, tilt_sigma_rad=1e-3, axis_rad=axis)
 
@@ -188,12 +152,12 @@ def test_the_axis_is_within_its_uncertainty() -> None:
     """30 pairs of five specimens, each with other noise. In such a set, one false match on its line made the RMS 6."""
     scores = []
     for specimen in range(5):
-        surface = _Specimen(specimen)
+        surface = _surface(specimen)
         greys = [surface.look(t, s)[0] for t, s in ((0.0, (0, 0)), (0.12, (3.3 * specimen, -4.7)))]
         for seed in range(6):
             one, two = (_expose(grey, 10 * seed + k) for k, grey in enumerate(greys))
             found = find_tilt_geometry(one, two, near_axis_rad=0.0)
-            scores.append((found.axis_rad - _AXIS_RAD) / np.sqrt(found.covariance[0, 0]))
+            scores.append((found.axis_rad - AXIS_RAD) / np.sqrt(found.covariance[0, 0]))
     # The RMS of 30 independent scores scatters by 0.13; those of one specimen share an error of a fraction of it.
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.45, scores
 
@@ -205,9 +169,9 @@ def test_a_false_match_on_its_epipolar_line_does_not_turn_the_axis(
 
     def with_a_false_one(first: Array, second: Array) -> tuple[Array, Array]:
         one, two = match(first, second)
-        across = np.array([-np.sin(_AXIS_RAD), np.cos(_AXIS_RAD)])
+        across = np.array([-np.sin(AXIS_RAD), np.cos(AXIS_RAD)])
         # 70 px along the line, and 1 px off it, which is within the tolerance.
-        wrong = two[:1] + 70.0 * across + np.array([np.cos(_AXIS_RAD), np.sin(_AXIS_RAD)])
+        wrong = two[:1] + 70.0 * across + np.array([np.cos(AXIS_RAD), np.sin(AXIS_RAD)])
         return np.vstack([one, one[:1]]), np.vstack([two, wrong])
 
     plain = find_tilt_geometry(images[1], images[2], near_axis_rad=0.0)
@@ -224,6 +188,6 @@ def test_a_false_match_on_its_epipolar_line_does_not_turn_the_axis(
 def test_too_little_overlap_is_refused_with_its_numbers(
     scene: tuple[list[Array], Array], shift: tuple[float, float], share: str
 ) -> None:
-    second, _ = _Specimen(1).see(_TILTS_RAD[2], seed=5, shift=shift)
+    second, _ = _see(_surface(1), _TILTS_RAD[2], seed=5, shift=shift)
     with pytest.raises(StructureError, match=rf"share {share}% of their field: .* shifted by "):
         measure_heights([scene[0][1], second], (0.0, _TILTS_RAD[2]), _PIXEL_M, tilt_sigma_rad=1e-3)

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.thresholds.fleets.rectification import make_settling_field
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
@@ -36,18 +37,7 @@ G = 2000.0
 
 
 def settling_field(strength_px: float) -> ResidualField:
-    """A beam that settles at the start of the lines, and a spiral, changing with the magnification."""
-    zero = zero_field(SIZE, (100.0, 10000.0), 3)
-    coefficients = zero.coefficients.copy()
-    # Near enough to where each basis function has its maximum.
-    x, y = (
-        np.array([np.mean(knots[k + 1 : k + 4]) for k in range(len(knots) - 4)])
-        for knots in (zero.knots_x, zero.knots_y)
-    )
-    amplitude = strength_px / (0.5 * SIZE[0]) * np.array([1.0, 1.3, 0.6])[:, None, None]
-    coefficients[..., 0] = amplitude * (np.exp(-(x + 1.0) / 0.15) + 0.5 * np.sin(3.0 * y)[:, None])
-    coefficients[..., 1] = amplitude * 0.5 * np.sin(3.0 * x) * np.cos(2.0 * y)[:, None]
-    return replace(zero, coefficients=coefficients)
+    return make_settling_field(SIZE, strength_px)
 
 
 def camera_with(field: ResidualField, g: float = G) -> ScanCamera:
