@@ -119,8 +119,11 @@ def draw() -> dict[str, Any]:
     creeping = draw_case(SEED + 1, SIZE, with_relay=False)
     pictures = tuple(_record_creeping(creeping))
     cases["creep"] = Drawn("extend", SEED + 1, False, creeping.calibration, pictures)
-    for way in ("length", "stage"):
-        cases[f"by a {way}"] = replace(drawn, action=way)
+    # Fewer pictures, of three magnifications.
+    upper = taken[PICTURES:]
+    few = tuple(one for number, one in enumerate(upper) if number % PICTURES != 2)
+    cases["by a length"] = replace(drawn, action="length", pictures=few)
+    cases["by a stage"] = replace(drawn, action="stage", pictures=upper)
     grains = Grains(int(plain.rng.integers(1 << 30)))
     for name, move in (("near", (0.2, -0.1)), ("far", (0.6, 0.55)), ("elsewhere", (7.0, 3.0))):
         cases[f"place {name}"] = _draw_place(plain, grains, move)
@@ -230,15 +233,15 @@ def _extend(case: Drawn, start: float) -> Answer:
 
 
 def _without_grid(case: Drawn, start: float) -> Answer:
-    scope, at = case.case.scope, case.pictures[PICTURES].magnification
+    scope, at = case.case.scope, case.pictures[0].magnification
     known: KnownLength | StageMoves
     if case.action == "length":
         ends = np.array([[40.0, 60.0], [190.0, 170.0]])
         x, y = scope.metres(at, *ends.T)
         length_m = math.hypot(x[1] - x[0], y[1] - y[0])
-        known = KnownLength(length_m, PICTURES, (40.0, 60.0), (190.0, 170.0), LENGTH_SIGMA)
+        known = KnownLength(length_m, 0, (40.0, 60.0), (190.0, 170.0), LENGTH_SIGMA)
     else:
-        moves = np.tile([(0.0, 0.0), (0.25, 0.08), (-0.07, 0.26), (0.03, -0.02)], (4, 1))
+        moves = np.tile([(0.0, 0.0), (0.25, 0.08), (-0.07, 0.26), (0.03, -0.02)], (3, 1))
         fields = np.array([scope.display_m / one.magnification for one in case.pictures])
         known = StageMoves(
             fields[:, None] * moves, 12.0 * np.arange(len(case.pictures)), LENGTH_SIGMA
