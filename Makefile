@@ -51,7 +51,7 @@ PYTEST := $(VENV_PYTHON) -m pytest -q -W error -n 3 --dist worksteal --rerun-sho
 # process is ended.
 END_STUCK := -o faulthandler_timeout=700 -o faulthandler_exit_on_timeout=true
 
-test: lint ## style, types, and all tests but the long ones (6 to 16 minutes on two cores)
+test: lint ## style, types, and all tests but the long ones (5 to 16 minutes on two cores)
 	@$(PYTEST) $(END_STUCK) $(PYTEST_ARGS) tests
 
 test-long: setup ## what takes long by nature: whole examples, tutorials, networks, endurance
