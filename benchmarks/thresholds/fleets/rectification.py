@@ -122,12 +122,12 @@ def draw() -> dict[str, Any]:
     scenes.SIZE = SIDE_PX
     for name, phase in PHASES_PX.items():
         pictures = [scenes.draw(scenes.KINDS[name], SEED + k, 1)[0][0] for k in range(PICTURES)]
-        shifted = tuple(_shift(picture, phase) for picture in pictures)
+        shifted = tuple(shift_odd_lines(picture, phase) for picture in pictures)
         cases[f"phase of {name}"] = PhaseCase(shifted, phase)
     x = np.arange(SIDE_PX)
     grating = 100.0 + 50.0 * np.sin(2.0 * np.pi * x / 8.0) * np.ones((SIDE_PX, 1))
     for phase in (1.3, 3.0):
-        lines = tuple(rng.normal(_shift(grating, phase), 8.0) for _ in range(PICTURES))
+        lines = tuple(rng.normal(shift_odd_lines(grating, phase), 8.0) for _ in range(PICTURES))
         cases[f"phase of a grating, {phase:g}"] = PhaseCase(lines, phase)
     signs = np.sign(rng.normal(size=(PICTURES, SIDE_PX, 1)))
     stripes = tuple(rng.normal(100.0 + 40.0 * one * np.ones(SIDE_PX), 8.0) for one in signs)
@@ -136,7 +136,7 @@ def draw() -> dict[str, Any]:
     cases["phase of noise"] = PhaseCase(noise, 0.0)
     gold, _, _ = scenes.draw(scenes.KINDS["gold"], SEED, STREAM_FRAMES)
     for declared in (True, False):
-        stream = tuple(_shift(frame, 3.4) for frame in gold)
+        stream = tuple(shift_odd_lines(frame, 3.4) for frame in gold)
         name = "declared" if declared else "not declared"
         cases[f"stream, {name}"] = PhaseCase(stream, 3.4, declared)
     return cases
@@ -171,7 +171,7 @@ def _expect(cameras: list[ScanCamera], drifts: list[RasterDrift | None]) -> MapC
     return MapCase(tuple(cameras), tuple(drifts), pixels, tuple(exact))
 
 
-def _shift(image: NDArray[Any], phase_px: float) -> Floats:
+def shift_odd_lines(image: NDArray[Any], phase_px: float) -> Floats:
     """The image with odd lines moved to the right, exactly, as a periodic one."""
     out = image.astype(np.float64)
     wave = np.exp(-2j * np.pi * np.fft.rfftfreq(image.shape[1]) * phase_px)

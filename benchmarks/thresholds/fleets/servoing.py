@@ -191,6 +191,22 @@ def _find(case: Pictures) -> Answer:
     )
 
 
+def see_target(
+    pose: PlanePose, camera: PlaneCamera, rng: np.random.Generator | None = None
+) -> TargetView:
+    """The markers that lie in a field of 512 px and are 20 to 350 px large; with noise from ``rng``."""
+    ids = np.arange(TARGET.size)
+    own = TARGET.corners_m(ids)
+    xy = camera.project(pose.apply(own.reshape(-1, 2))).reshape(-1, 4, 2)
+    side = np.linalg.norm(xy[:, 1] - xy[:, 0], axis=1)
+    seen = np.all((xy > 3) & (xy < 508), axis=(1, 2)) & (side > 20) & (side < 350)
+    if rng is not None:
+        xy = xy + rng.normal(0.0, SIGMA_PX, xy.shape)
+    covariance = np.broadcast_to(SIGMA_PX**2 * np.eye(8), (int(seen.sum()), 8, 8))
+    reason = "" if np.any(seen) else "no marker of the target in view"
+    return TargetView(ids[seen], own[seen], xy[seen], covariance, reason)
+
+
 class _Stage:
     """Obeys after a latency, over a ground that drifts; frames are instants."""
 
@@ -214,10 +230,11 @@ class _Stage:
     def step(self, g: float, *, scale: float) -> ServoStep:
         """Frame, latency, command, and the rest of the period."""
         seen_at, true = self.time_s, PlaneCamera.from_camera(SCOPE.camera_at(g))
-        view = self._see(true)
+        view = see_target(self.in_sem, true, self.rng)
         self._go(LATENCY_S)
-        off = np.array([[1.0, 0.0, self.case.axis_px[0]], [0.0, 1.0, self.case.axis_px[1]]])
-        known = np.vstack([off, [0.0, 0.0, 1.0]]) @ true.matrix @ np.diag([scale, scale, 1.0])
+        off_x, off_y = self.case.axis_px
+        off = np.array([[1.0, 0.0, off_x], [0.0, 1.0, off_y], [0.0, 0.0, 1.0]])
+        known = off @ true.matrix @ np.diag([scale, scale, 1.0])
         step = self.servo.update(
             view,
             PlaneCamera(known),
@@ -230,18 +247,6 @@ class _Stage:
         self.twist = step.twist
         self._go(PERIOD_S - LATENCY_S - self.case.late_s)
         return step
-
-    def _see(self, camera: PlaneCamera) -> TargetView:
-        """The markers that lie in a field of 512 px and are 20 to 350 px large."""
-        ids = np.arange(TARGET.size)
-        own = TARGET.corners_m(ids)
-        xy = camera.project(self.in_sem.apply(own.reshape(-1, 2))).reshape(-1, 4, 2)
-        side = np.linalg.norm(xy[:, 1] - xy[:, 0], axis=1)
-        seen = np.all((xy > 3) & (xy < 508), axis=(1, 2)) & (side > 20) & (side < 350)
-        xy = xy + self.rng.normal(0.0, SIGMA_PX, xy.shape)
-        covariance = np.broadcast_to(SIGMA_PX**2 * np.eye(8), (int(seen.sum()), 8, 8))
-        reason = "" if np.any(seen) else "no marker of the target in view"
-        return TargetView(ids[seen], own[seen], xy[seen], covariance, reason)
 
 
 def _servo(case: Loop) -> Answer:
@@ -269,8 +274,7 @@ def _servo(case: Loop) -> Answer:
         len(moved),
         float(np.sqrt(np.mean(error**2))),
         float(error.max()),
-        float("nan"),
-        int(last.converged and bool(off_px > 2.0 * case.settings.tolerance_px)),
-        bits,
-        seconds,
+        wrong=int(last.converged and bool(off_px > 2.0 * case.settings.tolerance_px)),
+        digest=bits,
+        seconds=seconds,
     )

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from benchmarks.thresholds.fleets.servoing import see_target
 from semcal_ros.applications.servoing import (
     CommandHistory,
     NestedTarget,
@@ -32,7 +33,6 @@ from semcal_ros.applications.servoing import (
     ServoSettings,
     ServoStatus,
     ServoStep,
-    TargetView,
     choose_projection,
     compute_interaction_matrix,
     fit_pose,
@@ -42,29 +42,12 @@ from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.synthetic import preset
 
 SCOPE = preset("jsm820")
-TARGET = NestedTarget()
-SIGMA_PX = 0.03
 PERIOD_S = 0.5
 LATENCY_S = 0.2
 
 
 def camera_at(g: float) -> PlaneCamera:
     return PlaneCamera.from_camera(SCOPE.camera_at(g))
-
-
-def view_of(
-    pose: PlanePose, camera: PlaneCamera, rng: np.random.Generator | None = None
-) -> TargetView:
-    """The markers that lie in a field of 512 px and are 20 to 350 px large."""
-    ids = np.arange(TARGET.size)
-    own = TARGET.corners_m(ids)
-    xy = camera.project(pose.apply(own.reshape(-1, 2))).reshape(-1, 4, 2)
-    side = np.linalg.norm(xy[:, 1] - xy[:, 0], axis=1)
-    seen = np.all((xy > 3) & (xy < 508), axis=(1, 2)) & (side > 20) & (side < 350)
-    noise = np.zeros_like(xy) if rng is None else rng.normal(0.0, SIGMA_PX, xy.shape)
-    covariance = np.broadcast_to(SIGMA_PX**2 * np.eye(8), (int(seen.sum()), 8, 8))
-    reason = "" if np.any(seen) else "no marker of the target in view"
-    return TargetView(ids[seen], own[seen], (xy + noise)[seen], covariance, reason)
 
 
 # -- cameras --------------------------------------------------------------------------------------
@@ -133,7 +116,7 @@ def test_a_pose_is_found_with_an_honest_uncertainty() -> None:
     pose, camera = PlanePose(4e-6, -2e-6, 0.4), camera_at(2500.0)
     scores = []
     for _ in range(200):
-        fit = fit_pose(view_of(pose, camera, rng), camera)
+        fit = fit_pose(see_target(pose, camera, rng), camera)
         assert fit.accepted
         scores.append(fit.pose.minus(pose) / np.sqrt(np.diag(fit.covariance)))
     # The RMS of 200 numbers has a sigma of 5 %; the covariance is widened where chi2 says so, never narrowed.
@@ -143,7 +126,7 @@ def test_a_pose_is_found_with_an_honest_uncertainty() -> None:
 
 def test_a_misread_marker_is_left_out_and_a_contradiction_refused() -> None:
     camera, pose = camera_at(1000.0), PlanePose(2e-6, 1e-6, -0.3)
-    view = view_of(pose, camera)
+    view = see_target(pose, camera)
     wrong = view.xy.copy()
     wrong[0] += 40.0
     fit = fit_pose(view.with_corners(wrong), camera)
@@ -205,7 +188,7 @@ class Plant:
         seen_at = self.time_s
         # As in image_rect: the drift is taken out of the image, and told.
         shown = self.pose if self.held else self.in_sem
-        view = view_of(shown, camera_at(g), self.rng)
+        view = see_target(shown, camera_at(g), self.rng)
         self._go(LATENCY_S)
         step = self.servo.update(
             view,
@@ -393,7 +376,7 @@ def test_bad_values_are_refused_with_a_reason() -> None:
         PlaneCamera(np.zeros((3, 3)))
     servo, camera = Servo(GOAL), camera_at(500.0)
     with pytest.raises(InvalidValueError, match="interval"):
-        servo.update(view_of(GOAL, camera), camera, 0.0, interval_s=0.0)
+        servo.update(see_target(GOAL, camera), camera, 0.0, interval_s=0.0)
 
 
 def test_a_turn_about_an_axis_beside_the_target_is_foretold() -> None:
@@ -409,7 +392,9 @@ def test_a_turn_about_an_axis_beside_the_target_is_foretold() -> None:
 
     servo = Servo(turned(rate * latency_s), rotation_centre_m=(6e-6, -4e-6))
     servo.record_command(0.0, (0.0, 0.0, rate))
-    step = servo.update(view_of(pose, camera), camera, 3.0, interval_s=0.5, now_s=3.0 + latency_s)
+    step = servo.update(
+        see_target(pose, camera), camera, 3.0, interval_s=0.5, now_s=3.0 + latency_s
+    )
     assert step.rejection is None
     # The origin moves by 0.7 um in that time.
     assert np.hypot(*step.twist[:2]) < 1e-3 * 0.7e-6
@@ -432,7 +417,7 @@ def test_a_knock_is_not_drift_unless_it_persists() -> None:
 @pytest.mark.parametrize(("sigmas", "converged"), [(1.5, False), (2.5, True)])
 def test_a_goal_is_only_reached_where_that_is_certain(sigmas: float, converged: bool) -> None:
     camera, pose = camera_at(1000.0), PlanePose(2e-6, 1e-6, 0.3)
-    view = view_of(pose, camera)
+    view = see_target(pose, camera)
     sigma_px = Servo(pose).update(view, camera, 0.0, interval_s=0.5).sigma_px
     servo = Servo(pose, ServoSettings(tolerance_px=sigmas * sigma_px))
     steps = [servo.update(view, camera, 0.5 * k, interval_s=0.5) for k in range(20)]
@@ -450,7 +435,7 @@ def test_the_stated_uncertainty_has_that_of_the_scale_and_convergence_has_not(
     known = replace(own, covariance=np.diag([(scale_sigma * own.m) ** 2, *[0.0] * 9]))
     camera, pose = PlaneCamera.from_camera(known), PlanePose(*place_m, 0.3)
     plain = replace(camera, scale_covariance=None)
-    view = view_of(pose, camera)
+    view = see_target(pose, camera)
     steps = [Servo(pose).update(view, c, 0.0, interval_s=0.5) for c in (plain, camera)]
     extra_m = math.sqrt(steps[1].sigma_m ** 2 - steps[0].sigma_m ** 2)
     # A relative error of the scale moves a point by that part of its distance from the axis, and the image's own

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from benchmarks.drift.scenes import KINDS, draw
+from benchmarks.thresholds.fleets.rectification import shift_odd_lines
 from semcal_ros.core.arrays import AnyImage, Array
 from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.rectification.line_phase import (
@@ -32,14 +33,6 @@ from semcal_ros.core.rectification.line_phase import (
     remove_line_phase,
 )
 from tests.helpers.long_tests import long_but
-
-
-def shifted(image: AnyImage, phase_px: float) -> Array:
-    """The image with odd lines moved to the right, exactly, as a periodic one."""
-    out = image.astype(np.float64)
-    wave = np.exp(-2j * np.pi * np.fft.rfftfreq(image.shape[1]) * phase_px)
-    out[1::2] = np.fft.irfft(np.fft.rfft(out[1::2], axis=1) * wave, image.shape[1], axis=1)
-    return out
 
 
 @cache
@@ -59,7 +52,7 @@ def noisy_scene(name: str) -> AnyImage:
 )
 @pytest.mark.parametrize("phase_px", long_but(lambda phase: phase == -6.0, [-6.0, 0.3, 2.7]))
 def test_the_phase_is_right_within_its_sigma(name: str, phase_px: float) -> None:
-    found = estimate_line_phase(shifted(noisy_scene(name), phase_px))
+    found = estimate_line_phase(shift_odd_lines(noisy_scene(name), phase_px))
     assert found.sigma_px < 0.06
     # Once in 15000.
     assert abs(found.shift_px - phase_px) < 4.0 * found.sigma_px
@@ -71,7 +64,7 @@ def test_the_sigma_is_that_of_the_scatter() -> None:
     clean = clean / clean.std()
     rng = np.random.default_rng(1)
     found = [
-        estimate_line_phase(shifted(clean, 1.3) + rng.normal(0.0, 1.0, clean.shape))
+        estimate_line_phase(shift_odd_lines(clean, 1.3) + rng.normal(0.0, 1.0, clean.shape))
         for _ in range(40)
     ]
     z = np.array([(f.shift_px - 1.3) / f.sigma_px for f in found])
@@ -94,10 +87,10 @@ def test_stripes_along_the_lines_tell_none(seed: int) -> None:
 def test_of_what_repeats_only_the_phase_below_a_quarter_of_the_period_is_told() -> None:
     x, rng = np.arange(256), np.random.default_rng(0)
     grating = 100.0 + 50.0 * np.sin(2.0 * np.pi * x / 8.0) * np.ones((256, 1))
-    told = estimate_line_phase(rng.normal(shifted(grating, 1.3), 8.0))
+    told = estimate_line_phase(rng.normal(shift_odd_lines(grating, 1.3), 8.0))
     assert abs(told.shift_px - 1.3) < 4.0 * told.sigma_px < 0.1
     for phase in (3.0, -2.7, 4.0):
-        lines, frame = LinePhaseCorrector(True), rng.normal(shifted(grating, phase), 8.0)
+        lines, frame = LinePhaseCorrector(True), rng.normal(shift_odd_lines(grating, phase), 8.0)
         assert lines.correct(frame) is frame
         assert "were not moved" in lines.note
 
@@ -129,7 +122,7 @@ def test_a_stream_is_freed_of_it_and_tracked_as_without() -> None:
     frames, drift = scene("gold")
     lines, tracker = LinePhaseCorrector(True), DriftTracker()
     for k, frame in enumerate(frames):
-        raw = np.clip(np.rint(shifted(frame, 3.4)), 0, 255).astype(np.uint8)
+        raw = np.clip(np.rint(shift_odd_lines(frame, 3.4)), 0, 255).astype(np.uint8)
         update = tracker.update(lines.correct(raw), float(k))
         assert update.accepted
     assert abs(lines.phase.shift_px - 3.4) < 4.0 * lines.phase.sigma_px < 0.1
@@ -142,12 +135,12 @@ def test_another_phase_is_followed_at_once() -> None:
     lines = LinePhaseCorrector(True)
     for phase in (3.4, 1.2):
         for _ in range(3):
-            lines.correct(shifted(frame, phase).astype(np.float32))
+            lines.correct(shift_odd_lines(frame, phase).astype(np.float32))
         assert abs(lines.phase.shift_px - phase) < 0.1
 
 
 def test_an_undeclared_phase_is_said_and_left() -> None:
-    frame = shifted(noisy_scene("gold"), 2.0).astype(np.float32)
+    frame = shift_odd_lines(noisy_scene("gold"), 2.0).astype(np.float32)
     lines = LinePhaseCorrector(False)
     assert lines.correct(frame) is frame
     assert "bidirectional: true" in lines.note
