@@ -708,6 +708,7 @@ class VisualServo(SemNode):
         note("servo_axis_px", "{:.2f}, {:.2f}".format(*step.axis_px))
         note("servo_axis_sigma_px", step.axis_sigma_px)
         note("servo_drift_m_s", float(np.hypot(*step.drift_m_s)))
+        note("servo_response", "{:.3f}, {:.3f}; {:.3f}, {:.3f}".format(*step.response.ravel()))
         note("servo_resets", self._resets)
 
     def conditions(self) -> list[str]:

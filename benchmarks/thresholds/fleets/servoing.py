@@ -56,6 +56,8 @@ SIGMA_PX, PERIOD_S, LATENCY_S = 0.03, 0.5, 0.2
 GOAL = PlanePose(3e-6, -2e-6, 0.05)
 QUICK = ServoSettings(gain_hz=2.0, travel_limit_px=40.0)
 ZOOM = (500.0,) * 14 + (1200.0,) * 4 + (2500.0,) * 4 + (5000.0,) * 8
+# While the target is on its way.
+EARLY_ZOOM = (500.0,) * 5 + (1000.0,) * 8 + (2000.0,) * 20
 JUDGED_FRAMES = 4
 
 
@@ -128,6 +130,9 @@ def draw() -> dict[str, Any]:
         "knock": Loop(drift_m_s=steady, knock=True),
         "renewed calibration": Loop(renewed=True),
         "lame stage": Loop(obeys=0.95 * np.eye(3)),
+        "weak stage": Loop(obeys=np.diag([0.6, 0.6, 1.0]), zoom=EARLY_ZOOM),
+        "uneven stage": Loop(obeys=np.diag([0.7, 1.3, 1.0]), drift_m_s=steady, zoom=EARLY_ZOOM),
+        "held for long": Loop(drift_m_s=(100e-9, -60e-9), zoom=ZOOM + (5000.0,) * 200),
         "stuck stage": Loop(obeys=np.zeros((3, 3)), zoom=(500.0,) * 20),
         "mirrored stage": Loop(obeys=mirrored, zoom=(500.0,) * 20),
         "eager stage": Loop(obeys=4.0 * np.eye(3), zoom=(500.0,) * 20),

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from semcal_ros.applications.servoing.law import Servo, ServoSettings, ServoStatus, ServoStep
-from semcal_ros.applications.servoing.motion import CommandHistory, DisturbanceObserver
+from semcal_ros.applications.servoing.motion import CommandHistory, MotionObserver
 from semcal_ros.applications.servoing.plane_camera import (
     AxisObserver,
     PlaneCamera,
@@ -34,7 +34,7 @@ from semcal_ros.applications.servoing.target import NestedTarget, TargetView, fi
 __all__ = [
     "AxisObserver",
     "CommandHistory",
-    "DisturbanceObserver",
+    "MotionObserver",
     "NestedTarget",
     "PlaneCamera",
     "PlanePose",

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 
 from semcal_ros.applications.servoing.motion import (
     CommandHistory,
-    DisturbanceObserver,
+    MotionObserver,
     StageMonitor,
 )
 from semcal_ros.applications.servoing.plane_camera import AxisObserver, PlaneCamera
@@ -47,6 +47,7 @@ from semcal_ros.applications.servoing.thresholds import (
     GAIN_MAX,
     GAIN_WITHOUT_TIMES_MAX,
     LATENCY_MAX_S,
+    RESPONSE_RATIO,
 )
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.errors import InvalidValueError, Rejection
@@ -159,6 +160,8 @@ class ServoStep:
         The pose in the frame; None if no pose was fitted.
     drift_m_s
         (2,) drift velocity that the command compensates.
+    response
+        (2, 2) travel of the stage per commanded travel, as seen so far.
     axis_px, axis_sigma_px
         (2,) offset of the optical axis from the principal point of the camera, and its 1-sigma: the
         position of the goal in the sem frame is not known any better.
@@ -181,6 +184,7 @@ class ServoStep:
     sigma_m: float = float("inf")
     fit: PoseFit | None = None
     drift_m_s: Array = field(default_factory=lambda: np.zeros(2))
+    response: Array = field(default_factory=lambda: np.eye(2))
     axis_px: Array = field(default_factory=lambda: np.zeros(2))
     axis_sigma_px: float = float("inf")
     gain_hz: float = 0.0
@@ -240,7 +244,7 @@ class Servo:
         self._last: _PosedFrame | None = None
         self._near = 0
         self._monitor = StageMonitor()
-        self._observer = DisturbanceObserver(
+        self._observer = MotionObserver(
             self.settings.drift_sigma_m_s, self.settings.drift_change_m_s
         )
 
@@ -353,12 +357,14 @@ class Servo:
         before = self._last
         if before is None or camera.is_same(before.camera) or time_s <= before.time_s:
             return False
-        interval_s = time_s - before.time_s
         way, seen, variance = self._compare_travel(fit, before, time_s)
-        drift = self._observer.velocity_m_s * interval_s
-        variance = variance + self._observer.variance * interval_s**2
+        beyond, spread = self._observer.predict(time_s - before.time_s, way)
         return self._axis_observer.update(
-            before.camera, camera, fit.pose.values[:2], seen - way - drift, np.diag(variance)
+            before.camera,
+            camera,
+            fit.pose.values[:2],
+            seen - way - beyond,
+            np.diag(variance + spread),
         )
 
     def _learn(self, fit: PoseFit, camera: PlaneCamera, time_s: float) -> None:
@@ -370,8 +376,20 @@ class Servo:
             return
         way, seen, variance = self._compare_travel(fit, before, time_s)
         slope = camera.jacobian(fit.pose.values[None, :2])[0]
-        self.fault = self._monitor.update(slope @ way, slope @ seen)
-        self._observer.update(time_s - before.time_s, seen - way, variance)
+        # A stage that holds a target against drift is commanded all the time, and nothing moves.
+        interval_s = time_s - before.time_s
+        drift = interval_s * self._observer.velocity_m_s
+        against = self._observer.find_command(-drift)
+        self.fault = self._monitor.update(slope @ (way - against), slope @ seen)
+        image = float(np.trace(fit.covariance[:2, :2] + before.covariance[:2, :2])) / 2.0
+        answered = image + float(drift @ drift)
+        self._observer.update(
+            interval_s,
+            way,
+            seen - way,
+            variance,
+            with_response=float(way @ way) > RESPONSE_RATIO**2 * answered,
+        )
 
     # -- command ----------------------------------------------------------------------------------
 
@@ -390,12 +408,12 @@ class Servo:
         ahead = fit.pose
         if known:
             way = self._way(time_s, time_s + latency_s, fit.pose)
-            dx, dy = way[:2] + drift * latency_s
+            dx, dy = way[:2] + self._observer.excess @ way[:2] + drift * latency_s
             ahead = fit.pose.displace(float(dx), float(dy), float(way[2]))
         most = GAIN_MAX if known else GAIN_WITHOUT_TIMES_MAX
         gain_hz = min(limits.gain_hz, most / interval_s)
         twist = -gain_hz * self._correction(fit, camera, ahead)
-        twist[:2] -= drift
+        twist[:2] = self._observer.find_command(twist[:2] - drift)
         twist, limited = self._limit(twist, fit, camera, interval_s)
         sigma_px = _compute_origin_sigma(fit, camera)[1]
         error = fit.pose.minus(self.goal)
@@ -419,6 +437,7 @@ class Servo:
             sigma_m=sigma_m,
             fit=fit,
             drift_m_s=drift.copy(),
+            response=np.eye(2) + self._observer.excess,
             axis_px=self._axis_observer.offset_px.copy(),
             axis_sigma_px=self._axis_observer.sigma_px,
             gain_hz=gain_hz,

@@ -27,6 +27,7 @@ from semcal_ros.applications.servoing.thresholds import (
     GATE_SIGMAS,
     JUDGED_PX,
     ODD_MAX,
+    RESPONSE_SIGMA,
     TRAVEL_MAX,
     TRAVEL_MIN,
 )
@@ -75,25 +76,56 @@ class CommandHistory:
         return way
 
 
-class DisturbanceObserver:
-    """Kalman filter, per axis, of the velocity that commands do not explain, such as drift.
+class MotionObserver:
+    """Kalman filter, per axis, of the drift and of how the stage responds to commands.
+
+    A piezo stage without a sensor may go a third less or more than it is told, and along axes that are turned a little.
+    That shows while it moves, and drift while it stands.
 
     Parameters
     ----------
     sigma_m_s
-        1-sigma of the velocity before anything is seen.
+        1-sigma of the drift velocity before anything is seen.
     change_m_s
         1-sigma of its change within a second.
+
+    Attributes
+    ----------
+    velocity_m_s
+        (2,) drift velocity.
+    excess
+        (2, 2) response of the stage beyond the commanded travel: ``excess @ way`` is added to it.
     """
 
     def __init__(self, sigma_m_s: float, change_m_s: float) -> None:
         self._sigma, self._change = sigma_m_s, change_m_s
         self._odd = 0
         self.velocity_m_s: Array = np.zeros(2)
-        self.variance: Array = np.full(2, sigma_m_s**2)
+        self.excess: Array = np.zeros((2, 2))
+        self._covariance = self._start(sigma_m_s)
 
-    def update(self, interval_s: float, unexplained_m: Array, variance_m2: Array) -> None:
-        """Update the filter with motion in an interval that the commands do not explain.
+    @staticmethod
+    def _start(sigma_m_s: float) -> Array:
+        """(2, 3, 3) covariance, for each axis, of the drift velocity and a row of the excess."""
+        each = np.diag(np.square([sigma_m_s, RESPONSE_SIGMA, RESPONSE_SIGMA]))
+        return np.array([each, each])
+
+    def predict(self, interval_s: float, way_m: Array) -> tuple[Array, Array]:
+        """Predict (2,) motion beyond the commanded travel (2,) of an interval, and its (2,) variance."""
+        by_state = np.array([interval_s, *way_m])
+        motion = self.velocity_m_s * interval_s + self.excess @ way_m
+        return motion, np.asarray(by_state @ self._covariance @ by_state, dtype=np.float64)
+
+    def update(
+        self,
+        interval_s: float,
+        way_m: Array,
+        unexplained_m: Array,
+        variance_m2: Array,
+        *,
+        with_response: bool = True,
+    ) -> None:
+        """Update the filter with the motion of an interval.
 
         An innovation far beyond expectation is a knock on the stage and not drift, unless it
         persists.
@@ -102,24 +134,49 @@ class DisturbanceObserver:
         ----------
         interval_s
             Time between two frames.
-        beside_m, variance_m2
-            (2,) travel seen minus travel commanded, and its variance.
+        way_m
+            (2,) travel commanded in it.
+        unexplained_m, variance_m2
+            (2,) travel seen minus that commanded, and its variance.
+        with_response
+            Whether it tells the response: a small command answers to drift, and to the noise of the frame before, which
+            is in the travel seen as well. Otherwise the response stays as it is, with its share in the uncertainty of
+            the drift (Schmidt-Kalman).
         """
         if interval_s <= 0.0:
             return
-        self.variance = self.variance + self._change**2 * interval_s
-        surprise = unexplained_m / interval_s - self.velocity_m_s
-        spread = self.variance + variance_m2 / interval_s**2 + 1e-30
-        if np.any(surprise**2 > GATE_SIGMAS**2 * spread):
+        self._covariance[:, 0, 0] += self._change**2 * interval_s
+        expected, spread = self.predict(interval_s, way_m)
+        innovation, spread = unexplained_m - expected, spread + variance_m2 + 1e-30
+        if np.any(innovation**2 > GATE_SIGMAS**2 * spread):
             self._odd += 1
             if self._odd >= ODD_MAX:
-                self.variance = np.full(2, (DRIFT_FACTOR * self._sigma) ** 2)
+                self._covariance = self._start(DRIFT_FACTOR * self._sigma)
                 self._odd = 0
             return
         self._odd = 0
-        gain = self.variance / spread
-        self.velocity_m_s = self.velocity_m_s + gain * surprise
-        self.variance = (1.0 - gain) * self.variance
+        by_state = np.array([interval_s, *way_m])
+        for axis in range(2):
+            gain = self._covariance[axis] @ by_state / spread[axis]
+            if not with_response:
+                gain[1:] = 0.0
+            change = gain * innovation[axis]
+            self.velocity_m_s[axis] += change[0]
+            self.excess[axis] += change[1:]
+            rest = np.eye(3) - np.outer(gain, by_state)
+            noise = variance_m2[axis] * np.outer(gain, gain)
+            self._covariance[axis] = rest @ self._covariance[axis] @ rest.T + noise
+
+    def find_command(self, travel_m_s: Array) -> Array:
+        """Return the (2,) command with which the stage moves at a velocity (2,).
+
+        A stage that obeys as badly as :class:`StageMonitor` refuses gets the velocity itself, until that stops it.
+        """
+        response = np.eye(2) + self.excess
+        along = np.linalg.eigvalsh(0.5 * (response + response.T))
+        if along[0] < TRAVEL_MIN or along[1] > TRAVEL_MAX:
+            return travel_m_s
+        return np.asarray(np.linalg.solve(response, travel_m_s), dtype=np.float64)
 
 
 class StageMonitor:

@@ -181,6 +181,17 @@ DRIFT_FACTOR = TABLE.stated(
     "DRIFT_FACTOR", 10.0, "ratio",
     "On the expected drift in that case.",
 )
+RESPONSE_SIGMA = TABLE.stated(
+    "RESPONSE_SIGMA", 0.3, "of the command",
+    "1-sigma of what a stage does beyond it, along each axis and across, before it has been seen to move: piezo stages "
+    "without a sensor.",
+)
+RESPONSE_RATIO = TABLE.derived(
+    "RESPONSE_RATIO", 10.0, "ratio",
+    "Of a command's travel to the drift and the noise of the image, above which it tells the response. A command "
+    "removes at most half of the noise of the frame before, and the response is off by 0.5 / 10^2 at most; one that "
+    "holds a target against drift is nearly constant, and cannot be told from it.",
+)
 JUDGED_PX = TABLE.measured(
     "JUDGED_PX", 36.0, "px",
     "Commanded travel after which the stage is judged: well above drift and noise in that time. 1.5 times as large, 1 "
