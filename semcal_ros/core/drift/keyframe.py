@@ -31,7 +31,10 @@ from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.thresholds import (
     BLUR_BELOW,
     COMMON_PX_MIN,
+    MERGED_GAINS,
     PIXEL_SIGMA_PX,
+    WORN_FRAMES,
+    WORN_RATIO,
 )
 from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.fractional_delay import FINE, sample_shifted
@@ -64,6 +67,12 @@ class Keyframe:
     compared
         Number of frames in the mean when it was last compared with the first of them
         (:func:`~semcal_ros.core.drift.matching.free_of_pull`).
+    residual
+        The least that any frame left unexplained, grey levels.
+    worn
+        How many frames in a row have left much more.
+    changes
+        How often the specimen had changed since the first keyframe of the chain from which this one was measured.
     """
 
     frame: ScanFrame
@@ -75,6 +84,9 @@ class Keyframe:
     turn: Array = field(default_factory=lambda: np.zeros(2))
     fixed: Mask | None = None
     compared: int = 0
+    residual: float = float("inf")
+    worn: int = 0
+    changes: int = 0
 
     @property
     def nbytes(self) -> int:
@@ -92,6 +104,20 @@ class Keyframe:
             raw=raw if raw.shape == self.mean.shape else None,
             fixed=self.fixed,
         )
+
+    @property
+    def is_worn(self) -> bool:
+        """Whether the specimen has changed since."""
+        return self.worn >= WORN_FRAMES
+
+    def note_match(self, registration: Registration) -> Keyframe:
+        """The keyframe after a frame was measured against it, and left more or less unexplained."""
+        # Amplified, a frame leaves more of its noise; with less contrast, it does not say what a usual one leaves.
+        residual = registration.alignment.residual_rms / max(registration.contrast, 1.0)
+        worn = self.worn + 1 if residual > WORN_RATIO * self.residual else 0
+        is_usual = registration.contrast > MERGED_GAINS[0]
+        least = min(residual, self.residual) if is_usual else self.residual
+        return replace(self, residual=least, worn=worn)
 
     def with_frame(
         self,

@@ -262,7 +262,8 @@ class KeyframeStore:
         """The keyframes that a frame can be registered against, the best first.
 
         The one in use comes first as long as its overlap is ``enough``; then those that overlap
-        more; then those of another scale, up to a factor of ``max_ratio``.
+        more; then those from which the specimen has changed; then those of another scale, up to a factor of
+        ``max_ratio``.
         """
         candidates = []
         for key, keyframe in self.keyframes.items():
@@ -272,9 +273,10 @@ class KeyframeStore:
                 common = np.clip(1.0 - np.abs(shift) / np.array(frame.size), 0.0, 1.0)
                 candidates.append(Candidate(key, ratio, float(common[0] * common[1])))
 
-        def rank(candidate: Candidate) -> tuple[bool, bool, float]:
+        def rank(candidate: Candidate) -> tuple[bool, bool, bool, float]:
             in_use = candidate.key == self.current
             good = candidate.overlap >= enough + (0.0 if in_use else CHANGE_MARGIN)
-            return candidate.rescaled, not (in_use and good), -candidate.overlap
+            is_worn = not in_use and self.keyframes[candidate.key].is_worn
+            return candidate.rescaled, is_worn, not (in_use and good), -candidate.overlap
 
         return sorted(candidates, key=rank)

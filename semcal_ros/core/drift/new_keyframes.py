@@ -89,16 +89,17 @@ def clone_measured(
     match: Match,
     measure: Measure,
     noise: Array,
+    *,
+    changes: int = 0,
 ) -> TrackerState:
     """Make this frame a keyframe, as it was measured against the one before; ``noise`` (2, 2) is the covariance of its
-    position as a keyframe about the measured one.
+    position as a keyframe about the measured one, and ``changes`` how often the specimen had changed.
     """
     drift, turn = state.filter.state, match.similarity.removed
-    store = state.keyframes.add(
-        make_keyframe(
-            frame, match.removed, match.image, match.region, drift.time_s, turn, match.fixed
-        )
+    keyframe = make_keyframe(
+        frame, match.removed, match.image, match.region, drift.time_s, turn, match.fixed
     )
+    store = state.keyframes.add(replace(keyframe, changes=changes))
     key, similarity = store.latest, state.similarity
     if match.candidate.rescaled:
         similarity = similarity.add_keyframe(key, turn, drift.time_s)
@@ -145,20 +146,29 @@ def renew_keyframe(
     if candidate.ratio > SMALL_ZOOM:
         # It became a keyframe when it was measured.
         return state, make_update(state, frame, DriftStatus.KEYFRAME, registration=registration)
-    state = replace(state, keyframes=state.keyframes.use(candidate.key))
+    store = state.keyframes.use(candidate.key)
+    noted = store[candidate.key].note_match(registration)
+    state = replace(state, keyframes=store.replace(candidate.key, noted))
     status, merged = DriftStatus.TRACKED, False
     overlap, enough = registration.alignment.overlap, setup.settings.rekey_overlap
-    is_changed = registration.correlation < KEPT_CORRELATION_MIN
+    is_changed = registration.correlation < KEPT_CORRELATION_MIN or (
+        # A tool that comes in is no change of the specimen.
+        noted.is_worn and registration.moving is None and not registration.alignment.may_be_pulled
+    )
     if is_changed or overlap < enough:
         following = state.keyframes.candidates(state.filter.state, frame, enough, SMALL_ZOOM)
         if is_changed or following[0].overlap < enough:
             share = COPY_NOISE + COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
+            if is_changed:
+                # What grows in the place of the rest pulls the same way each time: sigmas add up, and not variances.
+                share += 2.0 * noted.changes
             noise = match.measure.covariance[:2, :2] * share
             measure = match.measure
             if candidate.rescaled:
                 before = state.keyframes[candidate.key].frame
                 measure = add_zoom_uncertainty(measure, before, frame)
-            state = clone_measured(setup, state, frame, match, measure, noise)
+            changes = noted.changes + int(is_changed)
+            state = clone_measured(setup, state, frame, match, measure, noise, changes=changes)
             status = DriftStatus.KEYFRAME
     elif (
         setup.settings.average

@@ -186,6 +186,15 @@ KEPT_CORRELATION_MIN = TABLE.stated(
     "KEPT_CORRELATION_MIN", 0.75, "correlation",
     "A frame that agrees less with its keyframe takes its place: the specimen changes.",
 )
+WORN_RATIO = TABLE.stated(
+    "WORN_RATIO", 1.5, "ratio",
+    "Of what a frame leaves unexplained to the least that one has left: beyond it, half of its square is of a specimen "
+    "that has changed since.",
+)
+WORN_FRAMES = TABLE.stated(
+    "WORN_FRAMES", 3, "frames",
+    "In a row beyond it, after which the keyframe is replaced: a flash or a bad frame passes.",
+)
 MERGED_CORRELATION_MIN = TABLE.measured(
     "MERGED_CORRELATION_MIN", 0.85, "correlation",
     "Of a frame that becomes part of a mean: a specimen that changes spoils none before its keyframe is replaced. 1.5 "
