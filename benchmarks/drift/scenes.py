@@ -374,6 +374,8 @@ class Kind:
         Drift from frame to frame.
     jump_px, jump_line
         A move of the stage in the middle, and from which part of the lines of that frame on it shows.
+    replaced
+        Part of the ground in whose place another one of its kind has grown in the last frame.
     determined
         Whether the drift can be known at all.
     """
@@ -384,6 +386,7 @@ class Kind:
     step_px: float = 0.5
     jump_px: float = 0.0
     jump_line: float = 0.0
+    replaced: float = 0.0
     determined: bool = True
 
 
@@ -398,6 +401,8 @@ KINDS: dict[str, Kind] = {
     "gold and a move within a frame": Kind(gold, jump_px=60.0, jump_line=0.3),
     "ridges and a move within a frame": Kind(ridges, jump_px=20.0, jump_line=0.4),
     "fast gold": Kind(gold, step_px=3.0),
+    "gold that changes": Kind(gold, replaced=0.4),
+    "ridges that change": Kind(ridges, replaced=0.4),
     "sparse": Kind(sparse),
     "fine": Kind(fine),
     "fractal": Kind(fractal),
@@ -447,11 +452,13 @@ def draw(
     The bound is in px RMS of both axes together.
     """
     rng = np.random.default_rng(seed)
-    ground = kind.ground(rng)
-    spectrum = np.fft.rfft2(ground)
+    grounds = [kind.ground(rng)]
+    if kind.replaced:
+        grounds.append(kind.ground(rng))
     fx, fy = np.fft.rfftfreq(TORUS)[None, :], np.fft.fftfreq(TORUS)[:, None]
     # Nothing beyond half of the Nyquist frequency, or sampling would alias when it moves.
-    spectrum = spectrum * np.exp(-((np.hypot(fx, fy) / 0.22) ** 2))
+    low_pass = np.exp(-((np.hypot(fx, fy) / 0.22) ** 2))
+    spectra = [np.fft.rfft2(ground) * low_pass for ground in grounds]
     heading = rng.uniform(0, 2 * np.pi)
     steps = kind.step_px * np.array([np.cos(heading), np.sin(heading)]) * np.ones((FRAMES, 1))
     wobble = np.cumsum(rng.normal(0, 0.12 * kind.step_px, (FRAMES, 2)), axis=0)
@@ -463,16 +470,18 @@ def draw(
     margin = (TORUS - SIZE) // 2
     frames, bounds = [], []
 
-    def show(at_px: Floats) -> Floats:
+    def show(at_px: Floats, k: int) -> Floats:
+        share = kind.replaced * k / (FRAMES - 1)
+        spectrum = (1.0 - share) * spectra[0] + share * spectra[-1]
         turned = np.exp(-2j * np.pi * (fx * at_px[0] + fy * at_px[1]))
         moved = np.fft.irfft2(spectrum * turned, (TORUS, TORUS))
         return moved[margin : margin + SIZE, margin : margin + SIZE]
 
     for k, at_px in enumerate(drift[:count]):
-        view = show(at_px)
+        view = show(at_px, k)
         if kind.jump_line and k == FRAMES // 2:
             first = slice(0, int(kind.jump_line * SIZE))
-            view[first] = show(at_px - jump)[first]
+            view[first] = show(at_px - jump, k)[first]
         clean = kind.foreground(
             Frame(view, np.ones_like(view)), k, np.random.default_rng(foreground_seed)
         )

@@ -31,8 +31,10 @@ from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.thresholds import (
     BLUR_BELOW,
     COMMON_PX_MIN,
+    FRAMES_AVERAGED,
     MERGED_GAINS,
     PIXEL_SIGMA_PX,
+    USUAL_RATIO,
     WORN_FRAMES,
     WORN_RATIO,
 )
@@ -110,11 +112,29 @@ class Keyframe:
         """Whether the specimen has changed since."""
         return self.worn >= WORN_FRAMES
 
+    def allow_for_change(self, registration: Registration) -> Registration:
+        """The registration with a covariance that has what a specimen which has changed does to more than one frame.
+
+        Noise is another one in each frame, and what has changed is the same: it pulls all of them alike, and the filter
+        must not average it.
+        """
+        residual = _unexplained(registration)
+        if not residual > USUAL_RATIO * self.residual:
+            return registration
+        share = 1.0 - (USUAL_RATIO * self.residual / residual) ** 2
+        factor, alignment = 1.0 + (FRAMES_AVERAGED - 1.0) * share, registration.alignment
+        alignment = replace(
+            alignment,
+            covariance=factor * alignment.covariance,
+            joint_covariance=factor * alignment.joint_covariance,
+        )
+        return replace(registration, alignment=alignment)
+
     def note_match(self, registration: Registration) -> Keyframe:
         """The keyframe after a frame was measured against it, and left more or less unexplained."""
-        # Amplified, a frame leaves more of its noise; with less contrast, it does not say what a usual one leaves.
-        residual = registration.alignment.residual_rms / max(registration.contrast, 1.0)
+        residual = _unexplained(registration)
         worn = self.worn + 1 if residual > WORN_RATIO * self.residual else 0
+        # With less contrast, it does not say what a usual one leaves.
         is_usual = registration.contrast > MERGED_GAINS[0]
         least = min(residual, self.residual) if is_usual else self.residual
         return replace(self, residual=least, worn=worn)
@@ -162,6 +182,11 @@ class Keyframe:
             change[around[corner[1] : corner[1] + size[1], corner[0] : corner[0] + size[0]]] = 0.0
         part += change
         return replace(self, mean=mean, averaged=self.averaged + 1)
+
+
+def _unexplained(registration: Registration) -> float:
+    """Grey levels that a frame left unexplained; amplified, it leaves more of its noise."""
+    return registration.alignment.residual_rms / max(registration.contrast, 1.0)
 
 
 def make_keyframe(

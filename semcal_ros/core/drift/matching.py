@@ -189,6 +189,8 @@ def _register(
     )
     if registration.rejection is not None:
         return state, RejectedMatch(registration.rejection, registration)
+    if not candidate.rescaled:
+        registration = keyframe.allow_for_change(registration)
     averaged = np.inf if candidate.rescaled else float(state.keyframes.averaged(key))
     known, similarity = state.similarity.match(
         key, registration, turn, frame, averaged, measures=not candidate.rescaled

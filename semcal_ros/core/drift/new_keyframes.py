@@ -160,8 +160,9 @@ def renew_keyframe(
         if is_changed or following[0].overlap < enough:
             share = COPY_NOISE + COPY_NOISE_BESIDE * (1.0 - min(overlap, 1.0))
             if is_changed:
-                # What grows in the place of the rest pulls the same way each time: sigmas add up, and not variances.
-                share += 2.0 * noted.changes
+                # What grows in the place of the rest pulls all frames the same way, and from change to change: the
+                # sigmas of single frames add up, and not variances.
+                share += 2.0 * noted.changes + 1.0
             noise = match.measure.covariance[:2, :2] * share
             measure = match.measure
             if candidate.rescaled:

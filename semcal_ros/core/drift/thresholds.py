@@ -186,6 +186,15 @@ KEPT_CORRELATION_MIN = TABLE.stated(
     "KEPT_CORRELATION_MIN", 0.75, "correlation",
     "A frame that agrees less with its keyframe takes its place: the specimen changes.",
 )
+USUAL_RATIO = TABLE.stated(
+    "USUAL_RATIO", 1.15, "ratio",
+    "Of what a frame leaves unexplained to the least that one has left: up to it, noise and another part of the "
+    "specimen.",
+)
+FRAMES_AVERAGED = TABLE.stated(
+    "FRAMES_AVERAGED", 4.0, "frames",
+    "Over which the filter averages at least: an error that all of them share counts as often.",
+)
 WORN_RATIO = TABLE.stated(
     "WORN_RATIO", 1.5, "ratio",
     "Of what a frame leaves unexplained to the least that one has left: beyond it, half of its square is of a specimen "

@@ -268,6 +268,52 @@ def test_a_keyframe_is_carried_only_between_cameras() -> None:
     assert scale_ratio(near, frame) == pytest.approx(1.2)
 
 
+def left(residual: float, contrast: float = 1.0) -> Registration:
+    """A registration that leaves some grey levels unexplained."""
+    found = known((0.0, 0.0), gain=contrast)
+    alignment = replace(found.alignment, residual_rms=residual, covariance=1e-4 * np.eye(2))
+    return replace(found, alignment=alignment)
+
+
+@pytest.mark.parametrize(
+    ("residuals", "worn"),
+    [
+        ([4.0, 4.4, 5.8, 5.9], False),
+        ([4.4, 4.0, 6.1, 6.1], False),
+        ([4.0, 6.1, 6.1, 4.2, 6.1, 6.1], False),
+        ([4.0, 6.1, 6.1, 6.1], True),
+    ],
+    ids=["usual", "two frames", "a flash twice", "three frames"],
+)
+def test_three_frames_in_a_row_that_leave_half_as_much_again_wear_a_keyframe_out(
+    residuals: list[float], worn: bool
+) -> None:
+    key = keyframe(make_picture((0.0, 0.0), 3.0, 0))
+    for residual in residuals:
+        key = key.note_match(left(residual))
+    assert key.is_worn == worn
+
+
+def test_more_or_less_contrast_wears_no_keyframe_out() -> None:
+    key = keyframe(make_picture((0.0, 0.0), 3.0, 0)).note_match(left(4.0))
+    # Amplified by two, with its noise; then with half of the contrast, when there is less to be left.
+    for found in [left(8.0, 2.0)] * 4 + [left(2.0, 0.5)] * 4 + [left(4.2)] * 4:
+        key = key.note_match(found)
+    assert not key.is_worn
+    assert key.residual == 4.0
+
+
+def test_what_has_changed_counts_once_for_each_frame_over_which_is_averaged() -> None:
+    key = keyframe(make_picture((0.0, 0.0), 3.0, 0)).note_match(left(4.0))
+    usual, changed = left(4.5), left(2.0 * 1.15 * 4.0)
+    assert key.allow_for_change(usual) is usual
+    # Three quarters of the square are of the change, and count four times.
+    factor = 1.0 + 3.0 * 0.75
+    np.testing.assert_allclose(
+        key.allow_for_change(changed).covariance, factor * changed.covariance
+    )
+
+
 # -- the store ----------------------------------------------------------------------------------
 
 
@@ -323,6 +369,18 @@ def test_the_keyframe_in_use_comes_first_as_long_as_it_overlaps_enough() -> None
     # Nothing in common is still a candidate, and the last.
     far = store.candidates(state_with(places, (500.0, 0.0)), frame, 0.6, 2.5)
     assert all(c.overlap == 0.0 for c in far)
+
+
+def test_a_worn_keyframe_comes_after_the_others_unless_it_is_in_use() -> None:
+    picture = make_picture((0.0, 0.0), 3.0, 0)
+    worn = replace(keyframe(picture), worn=3)
+    store = KeyframeStore().add(worn).add(keyframe(picture)).add(worn)
+    state = state_with({0: (0.0, 0.0), 1: (120.0, 0.0), 2: (10.0, 0.0)}, (0.0, 0.0))
+    frame = ScanFrame(picture, None, None)
+    assert [c.key for c in store.candidates(state, frame, 0.6, 2.5)] == [2, 1, 0]
+    # Not in use any more, the last one is worn as well.
+    store = store.use(1)
+    assert [c.key for c in store.candidates(state, frame, 0.6, 2.5)] == [1, 0, 2]
 
 
 def test_keyframes_of_another_scale_come_last() -> None:

@@ -129,6 +129,22 @@ def test_rekeys_before_the_overlap_is_lost_and_chains_the_uncertainty() -> None:
     assert sigma[-1, 0] > 1.5 * sigma[6, 0]
 
 
+@pytest.mark.parametrize("name", ["gold that changes", "ridges that change"])
+def test_a_specimen_that_changes_is_followed_by_keyframes_that_change_with_it(name: str) -> None:
+    """Another one grows in its place, by 1.4 % in each frame; parts stop fitting the first keyframe at a quarter."""
+    frames, drift, _ = draw(KINDS[name], 101)
+    tracker = DriftTracker()
+    updates = [tracker.update(frame, float(k)) for k, frame in enumerate(frames)]
+    assert all(u.accepted for u in updates)
+    assert [u.status_text for u in updates].count("keyframe") >= 2
+    error = np.array([u.drift_px for u in updates])[1:] - drift[1:]
+    sigma = np.array([np.sqrt(np.diag(u.covariance)[:2]) for u in updates])[1:]
+    # What grows pulls all frames alike.
+    assert float(np.max(np.abs(error))) < 0.15
+    assert float(np.sqrt(np.mean((error / sigma) ** 2))) < 1.7
+    assert float(np.max(np.abs(error) / sigma)) < 3.5
+
+
 def test_carries_drift_through_changes_of_magnification() -> None:
     run = Run((0.15e-6, -0.1e-6))
     steps = [1500.0] * 3 + [2000.0] * 2 + [3500.0] * 2 + [2000.0] * 2 + [1500.0]
