@@ -63,6 +63,7 @@ WRONG_PX, WRONG_SIGMAS = 0.1, 3.0
 PX_M, SCALE_SIGMA = 1e-7, 0.003
 SHEARED_FRAMES, PASS_S = 30, 0.8
 BODY_FRAMES, BODY_STEP_PX = 18, 2.5
+CHANGED_FRAMES = 30
 # The ends of turned scans are told by few tiles.
 TURNED_SIZE, INNER = 320, np.linspace(0.2, 0.8, 13)
 
@@ -104,6 +105,11 @@ def draw() -> dict[str, Any]:
     for name in SCENES:
         frames, drift, _ = scenes.draw(scenes.KINDS[name], SEED)
         cases[name] = Stream(frames, drift, seconds)
+    scenes.FRAMES = CHANGED_FRAMES
+    for name in ("gold that changes", "ridges that change"):
+        frames, drift, _ = scenes.draw(scenes.KINDS[name], SEED + 1)
+        cases[name] = Stream(frames, drift, np.arange(float(CHANGED_FRAMES)))
+    scenes.FRAMES = FRAMES
     move = cases["gold and a stage move"]
     cases["gold and a stage move in hindsight"] = replace(move, look_at="hindsight")
     torn = list(cases["gold"].frames)

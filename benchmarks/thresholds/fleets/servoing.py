@@ -135,7 +135,7 @@ def draw() -> dict[str, Any]:
         "held for long": Loop(drift_m_s=(100e-9, -60e-9), zoom=ZOOM + (5000.0,) * 200),
         "stuck stage": Loop(obeys=np.zeros((3, 3)), zoom=(500.0,) * 20),
         "mirrored stage": Loop(obeys=mirrored, zoom=(500.0,) * 20),
-        "eager stage": Loop(obeys=4.0 * np.eye(3), zoom=(500.0,) * 20),
+        "eager stage": Loop(obeys=6.0 * np.eye(3), zoom=(500.0,) * 20),
     }
     return cases
 
