@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ def split_states(message: str) -> list[str]:
 
 
 class StreamStatistics:
-    """Counters, rate and latency of one stream.
+    """Counters, rate and latency of one stream, for any number of threads.
 
     Times are arguments, in seconds of any one monotonic clock.
 
@@ -76,6 +77,8 @@ class StreamStatistics:
     def __init__(self, window_s: float = 5.0, stale_after_s: float = 5.0) -> None:
         for name, value in (("window", window_s), ("stale time", stale_after_s)):
             check_positive(value, f"{name} of", "s")
+        # A replay counts in a thread of its own, while the node's reports.
+        self._lock = threading.RLock()
         self._window_s = window_s
         self._stale_after_s = stale_after_s
         self._recent: deque[tuple[float, float | None]] = deque()
@@ -107,34 +110,41 @@ class StreamStatistics:
 
     def receive(self, time_s: float) -> None:
         """Count a frame that arrived at ``time_s``."""
-        self._counts["received"] += 1
-        self._last_s = time_s
+        with self._lock:
+            self._counts["received"] += 1
+            self._last_s = time_s
 
     def publish(self, time_s: float, latency_s: float | None = None) -> None:
         """Count a result that left at ``time_s``.
 
         ``latency_s`` is the time since the stamp of its frame, or None if unknown.
         """
-        self._counts["published"] += 1
-        self._recent.append((time_s, latency_s))
-        self._forget(time_s)
+        with self._lock:
+            self._counts["published"] += 1
+            self._recent.append((time_s, latency_s))
+            self._forget(time_s)
 
     def drop(self, count: int = 1) -> None:
         """Count frames that were lost or overtaken."""
-        self._counts["dropped"] += count
+        with self._lock:
+            self._counts["dropped"] += count
 
     def reject(self, reason: str) -> None:
         """Count a message that could not be used and keep its reason."""
-        self._counts["rejected"] += 1
-        self._rejection = reason
+        with self._lock:
+            self._counts["rejected"] += 1
+            self._rejection = reason
 
     def note(self, key: str, value: object) -> None:
         """Show one more key/value pair, such as a residual; the latest value of a key stays."""
-        self._extra[key] = f"{value:.6g}" if isinstance(value, float) else str(value)
+        text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        with self._lock:
+            self._extra[key] = text
 
     def forget(self, key: str) -> None:
         """Show a key of :meth:`note` no longer, if it is shown."""
-        self._extra.pop(key, None)
+        with self._lock:
+            self._extra.pop(key, None)
 
     def _forget(self, now_s: float) -> None:
         while self._recent and self._recent[0][0] < now_s - self._window_s:
@@ -142,16 +152,18 @@ class StreamStatistics:
 
     def rate_hz(self, now_s: float) -> float:
         """Return the results per second over the window."""
-        self._forget(now_s)
-        if len(self._recent) < 2:
-            return 0.0
-        span = self._recent[-1][0] - self._recent[0][0]
-        return (len(self._recent) - 1) / span if span > 0.0 else 0.0
+        with self._lock:
+            self._forget(now_s)
+            if len(self._recent) < 2:
+                return 0.0
+            span = self._recent[-1][0] - self._recent[0][0]
+            return (len(self._recent) - 1) / span if span > 0.0 else 0.0
 
     def latency_s(self, now_s: float) -> tuple[float, float] | None:
         """Return the mean and the largest latency over the window, or None without any."""
-        self._forget(now_s)
-        known = [latency for _, latency in self._recent if latency is not None]
+        with self._lock:
+            self._forget(now_s)
+            known = [latency for _, latency in self._recent if latency is not None]
         return (sum(known) / len(known), max(known)) if known else None
 
     def summary(self, now_s: float) -> DiagnosticSummary:
@@ -159,24 +171,25 @@ class StreamStatistics:
 
         Stale without frames; a warning if frames were lost or refused since the last summary.
         """
-        troubles = self.dropped + self.rejected
-        fresh_troubles = troubles - self._troubles_reported
-        self._troubles_reported = troubles
-        rate = self.rate_hz(now_s)
-        if self._last_s is None:
-            level, message = DiagnosticLevel.STALE, "no frame received yet"
-        elif now_s - self._last_s > self._stale_after_s:
-            level = DiagnosticLevel.STALE
-            message = f"no frame for {now_s - self._last_s:.1f} s"
-        elif fresh_troubles:
-            level = DiagnosticLevel.WARN
-            message = f"{fresh_troubles} frames dropped or rejected"
-        else:
-            level, message = DiagnosticLevel.OK, f"{rate:.1f} Hz"
-        if fresh_troubles and self._rejection:
-            level = max(level, DiagnosticLevel.WARN)
-            message = join_states([message, f"last rejection: {self._rejection}"])
-        return DiagnosticSummary(level, message, self._values(now_s, rate))
+        with self._lock:
+            troubles = self.dropped + self.rejected
+            fresh_troubles = troubles - self._troubles_reported
+            self._troubles_reported = troubles
+            rate = self.rate_hz(now_s)
+            if self._last_s is None:
+                level, message = DiagnosticLevel.STALE, "no frame received yet"
+            elif now_s - self._last_s > self._stale_after_s:
+                level = DiagnosticLevel.STALE
+                message = f"no frame for {now_s - self._last_s:.1f} s"
+            elif fresh_troubles:
+                level = DiagnosticLevel.WARN
+                message = f"{fresh_troubles} frames dropped or rejected"
+            else:
+                level, message = DiagnosticLevel.OK, f"{rate:.1f} Hz"
+            if fresh_troubles and self._rejection:
+                level = max(level, DiagnosticLevel.WARN)
+                message = join_states([message, f"last rejection: {self._rejection}"])
+            return DiagnosticSummary(level, message, self._values(now_s, rate))
 
     def _values(self, now_s: float, rate: float) -> tuple[tuple[str, str], ...]:
         pairs = [(key, str(count)) for key, count in self._counts.items()]

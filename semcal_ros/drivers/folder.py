@@ -26,6 +26,7 @@ import hashlib
 import json
 import logging
 import os
+import stat
 import threading
 import time
 from collections import deque
@@ -286,7 +287,8 @@ class FolderSource:
                 found = [entry for entry in entries if self._counts(entry.name)]
                 states = []
                 for entry in found:
-                    with contextlib.suppress(FileNotFoundError):  # renamed meanwhile
+                    # Renamed meanwhile, a link to nowhere, or not to be read: the others are.
+                    with contextlib.suppress(OSError):
                         if entry.is_file():
                             about = entry.stat()
                             states.append(FileState(entry.name, about.st_size, about.st_mtime_ns))
@@ -330,6 +332,8 @@ class FolderSource:
         try:
             about = os.stat(self._folder / name)
         except OSError:
+            about = None
+        if about is None or not stat.S_ISREG(about.st_mode):
             self._candidates.pop(name, None)
             return
         self._see(FileState(name, about.st_size, about.st_mtime_ns), closed, now_s)

@@ -21,7 +21,9 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import rclpy.utilities
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
@@ -31,7 +33,13 @@ from std_srvs.srv import SetBool
 
 from semcal_ros.bridge.conditions import CONDITIONS_TYPE
 from semcal_ros.bridge.fields import fill_stamp
-from semcal_ros.core.errors import BagError, ConfigError, InvalidValueError, SemcalError
+from semcal_ros.core.errors import (
+    BagError,
+    ConfigError,
+    InvalidValueError,
+    MessageError,
+    SemcalError,
+)
 from semcal_ros.files.bags.held_values import CONDITIONS_TOPIC
 from semcal_ros.files.bags.reader import BagTopic, RawMessage, open_bag, topic_matches
 from semcal_ros.middleware import message_class
@@ -533,7 +541,14 @@ class BagPlayer(SemNode):
 
     def _publish(self, message: RawMessage) -> None:
         publisher = self._publishers_by_topic[message.topic]
-        publisher.publish(bytes(message.data))
+        try:
+            publisher.publish(bytes(message.data))
+        except (MessageError, RCLError) as error:
+            if not rclpy.utilities.ok():
+                raise
+            # One damaged message in a recording leaves the others as they are.
+            self.reporter.reject(error)
+            return
         self.reporter.count_published(None)
         if message.topic in self._undiscovered:
             self._wait_for_discovery(message.topic, message.log_time_ns)

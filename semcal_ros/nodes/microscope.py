@@ -26,6 +26,8 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Header
@@ -408,7 +410,8 @@ class Microscope(SemNode):
             self.endpoints.trigger_service("~/start", self._start),
             self.endpoints.trigger_service("~/stop", self._stop),
         ]
-        self._timer = self.create_timer(_LOOK_S, self._handle)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(_LOOK_S, self._handle, clock=steady)
         if self.parameters["start"]:
             self._runner.start()
 
@@ -467,8 +470,8 @@ class Microscope(SemNode):
     # -- frames ------------------------------------------------------------------------------------
 
     def now_s(self) -> float:
-        """Return the time on the steady clock of the node, s."""
-        return self.get_clock().now().nanoseconds * 1e-9
+        """Return the time on a steady clock, s: that of ROS stands still or goes back where it is simulated."""
+        return time.monotonic()
 
     def _waits_for_subscribers(self) -> bool:
         wanted = int(self.parameters["wait_for_subscribers"])

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 import os
-import struct
 import threading
 import time
 from collections import deque
@@ -39,7 +38,6 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
@@ -49,13 +47,13 @@ from semcal_ros.bridge.drift import UNKNOWN_VARIANCE
 from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.corners import find_lattice
-from semcal_ros.core.errors import InvalidValueError, Rejection
+from semcal_ros.core.errors import InvalidValueError, MessageError, Rejection
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.context import NodeContext
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.endpoints import Endpoints, read_stamp_ns, unpack
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.parameters import (
     CALIBRATION,
@@ -227,14 +225,6 @@ class _Waiting:
     data: bytes
 
 
-def _stamp_of(data: bytes) -> int:
-    """Read the stamp of a serialized message that begins with a header."""
-    # Four bytes of encapsulation, the second of which says the byte order.
-    order = "<" if data[1] & 1 else ">"
-    seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
 class ViewedImages:
     """Takes the newest raw and corrected image when asked, and only then unpacks them.
 
@@ -352,14 +342,14 @@ class ViewedImages:
 
     @staticmethod
     def _unpack(waiting: _Waiting, kind: Any) -> NDArray[Any]:
-        image, encoding = decoded_image(deserialize_message(waiting.data, kind))
+        image, encoding = decoded_image(unpack(waiting.data, kind))
         # The page draws in OpenCV's order of the channels.
         return image[..., ::-1] if encoding.startswith("rgb") else image
 
 
 def _waiting(taken: tuple[Any, Any]) -> _Waiting:
     data, info = taken
-    return _Waiting(_stamp_of(data), published_ns(info), data)
+    return _Waiting(read_stamp_ns(data), published_ns(info), data)
 
 
 class Viewer(SemNode):
@@ -538,9 +528,9 @@ class Viewer(SemNode):
             )
 
     def _poll(self) -> None:
-        for subscription in self._values:
-            subscription.take_waiting()
         try:
+            for subscription in self._values:
+                subscription.take_waiting()
             frame = self._images.take()
             if frame is not None:
                 self._show(frame)
@@ -598,13 +588,15 @@ class Viewer(SemNode):
 
     def _on_drift(self, message: Any, _info: Any) -> None:
         position, covariance = message.pose.pose.position, message.pose.covariance
+        if not np.all(np.isfinite([position.x, position.y, covariance[0], covariance[7]])):
+            raise MessageError("a drift that is not finite", expected="metres and their variances")
         sigma_m = math.sqrt(max(covariance[0], covariance[7], 0.0))
         self._trace.add(stamp_ns_from_msg(message), position.x, position.y, sigma_m, self._speed)
 
     def _on_velocity(self, message: Any, _info: Any) -> None:
         linear, covariance = message.twist.twist.linear, message.twist.covariance
         variance = max(covariance[0], covariance[7], 0.0)
-        known = variance < UNKNOWN_VARIANCE
+        known = variance < UNKNOWN_VARIANCE and math.isfinite(math.hypot(linear.x, linear.y))
         self._speed = (math.hypot(linear.x, linear.y), math.sqrt(variance)) if known else None
 
     def _on_diagnostics(self, message: Any, _info: Any) -> None:

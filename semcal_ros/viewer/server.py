@@ -621,6 +621,10 @@ class _Live(websocket.WebSocketHandler):
                 await asyncio.sleep(_POLL_S)
         except websocket.WebSocketClosedError:
             pass
+        except Exception:
+            # The page would stay as it is and say nothing; closed, it says so, and asks again.
+            logging.getLogger(__name__).exception("the page could not be fed")
+            self.close()
 
     def _may_send(self, now_s: float) -> bool:
         """Whether the page has shown the picture before; otherwise this one is left out."""

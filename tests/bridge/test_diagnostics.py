@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+import itertools
+import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -92,6 +95,30 @@ def test_fill_status(new: Callable[[str], Any]) -> None:
     assert pairs["residual_px"] == "0.0123457"
     assert float(pairs["rate_hz"]) == pytest.approx(10.0)
     assert float(pairs["latency_max_ms"]) == pytest.approx(30.0)
+
+
+def test_one_thread_reports_what_another_one_counts() -> None:
+    """A replay counts in its own thread; a queue that grows while it is read would raise."""
+    statistics, ended = StreamStatistics(window_s=0.5), threading.Event()
+
+    def count() -> None:
+        for k in itertools.count():
+            statistics.publish(1e-5 * k, latency_s=0.01)
+            statistics.note(f"key {k % 50}", k)
+            statistics.forget(f"key {(k + 25) % 50}")
+            if ended.is_set():
+                return
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    try:
+        until_s = time.monotonic() + 1.0
+        while time.monotonic() < until_s:
+            assert statistics.summary(1e9).message
+            statistics.latency_s(0.0)
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_refuses_nonsense() -> None:

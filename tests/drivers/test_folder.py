@@ -227,6 +227,9 @@ def test_other_files_are_left_alone(folder: Path, make: Callable[..., Any]) -> N
     for name in ("other.tif", ".view_1.tif", "view_1.txt", "view_1.mp4"):
         (folder / name).write_bytes(b"no picture")
     (folder / "view_2.tif").mkdir()
+    # A link to itself cannot be looked at, and a pipe would never end.
+    (folder / "view_4.tif").symlink_to("view_4.tif")
+    os.mkfifo(folder / "view_5.tif")
     assert source.read(NOTHING_S) is None
     save_sem_tiff(folder / "view_3.tif", numbered_image(3))
     assert read_all(source, 1) == [3]

@@ -272,6 +272,9 @@ def fit_plumb_bob(camera: ScanCamera, width: int, height: int) -> PlumbBobCamera
     rect_px = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     raw_px = fitted.raw_from_rect(rect_px)
     good = np.all(np.isfinite(raw_px), axis=1)
+    # An image of one line, or one that distortion folds over, tells no model.
+    if np.sum(good) < PLUMB_BOB_POINTS or min(width, height) < 2:
+        return None
     rect_px, raw_px = rect_px[good], raw_px[good]
     centre = np.array([rect.ex, rect.ey])
     offset = (centre - rect.K[:2, 2]) / f

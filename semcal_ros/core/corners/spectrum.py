@@ -148,7 +148,9 @@ class Spectrum:
         """
         length = float(np.linalg.norm(frequency))
         ratio = np.abs(self.fx * frequency[0] + self.fy * frequency[1]) / length**2
-        clearest = float(self.clearness[self.is_peak & (ratio < MULTIPLES_COMPARED)].max())
+        peaks = self.clearness[self.is_peak & (ratio < MULTIPLES_COMPARED)]
+        # A picture of few pixels has few frequencies, and there may be no peak among the low ones.
+        clearest = float(peaks.max(initial=0.0))
         among = self.clearness > max(SUBMULTIPLE_POWER, FAINT_PEAK * clearest)
         among &= self.power > SIDE_LOBE_POWER * highest
         among &= (

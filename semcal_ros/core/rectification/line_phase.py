@@ -122,7 +122,8 @@ def estimate_line_phase(image: AnyImage) -> LinePhase:
             return LinePhase(0.0, np.inf)
         if abs(step) < PHASE_CONVERGED * sigma:
             break
-    return LinePhase(shift, sigma)
+    # Lines that are all alike, as of a test picture, do not scatter.
+    return LinePhase(shift, max(sigma, 1e-6))
 
 
 def _choose_lag(correlation: Array, lags: NDArray[np.int_]) -> int | None:
@@ -246,6 +247,6 @@ class LinePhaseCorrector:
         if not np.isfinite(old.sigma_px):
             self.phase = found
             return
-        weights = np.array([PHASE_MEMORY * old.sigma_px**-2.0, max(found.sigma_px, 1e-6) ** -2.0])
+        weights = np.array([PHASE_MEMORY * old.sigma_px**-2.0, found.sigma_px**-2.0])
         shift = float(weights @ [old.shift_px, found.shift_px] / weights.sum())
         self.phase = LinePhase(shift, float(weights.sum() ** -0.5))

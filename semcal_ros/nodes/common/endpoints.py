@@ -19,12 +19,14 @@ A short want of room in the middleware does not end a publisher, and it knows wh
 
 from __future__ import annotations
 
+import struct
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import rclpy.utilities
-from rclpy._rclpy_pybind11 import RCLError
+from rclpy._rclpy_pybind11 import RCLError, RMWError
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -32,6 +34,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
+from semcal_ros.core.errors import MessageError
 from semcal_ros.nodes.common.qos import (
     camera_output,
     latched,
@@ -126,8 +129,7 @@ class PatientPublisher(Publisher):
         return not self._keeps and not super().get_subscription_count()
 
     def _unpacked(self, message: Any) -> Any:
-        serialized = isinstance(message, bytes)
-        return deserialize_message(message, self.msg_type) if serialized else message
+        return unpack(message, self.msg_type) if isinstance(message, bytes) else message
 
     def _takes(self, msg: Any) -> bool:
         try:
@@ -137,6 +139,45 @@ class PatientPublisher(Publisher):
                 raise
             return False
         return True
+
+
+def unpack(data: bytes, message_type: Any) -> Any:
+    """Return the message of a type from its serialized bytes.
+
+    Raises
+    ------
+    MessageError
+        If they are damaged, as in a recording that was cut off.
+    """
+    try:
+        return deserialize_message(data, message_type)
+    except RMWError as error:
+        raise _damaged(data) from error
+
+
+def read_stamp_ns(data: bytes) -> int:
+    """Read the stamp of a serialized message that begins with a header, ns.
+
+    Raises
+    ------
+    MessageError
+        If there are too few bytes for one.
+    """
+    try:
+        # Four bytes of encapsulation, the second of which says the byte order.
+        order = "<" if data[1] & 1 else ">"
+        seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
+    except (IndexError, struct.error) as error:
+        raise _damaged(data) from error
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def _damaged(data: bytes) -> MessageError:
+    return MessageError(
+        f"a serialized message of {len(data)} bytes that cannot be read",
+        expected="a message as it was published",
+        do="check the recording or the bridge that it comes from",
+    )
 
 
 class Guard:
@@ -307,7 +348,7 @@ class Endpoints:
         name, group
             Where it is served.
         handler
-            Does the work and returns the answer; an exception of :data:`NODE_ERRORS` becomes the reason of a refusal.
+            Does the work and returns the answer; an exception becomes the reason of a refusal.
         on_answer
             Called with the success flag and the answer.
         """
@@ -318,6 +359,16 @@ class Endpoints:
                 response.success = True
             except NODE_ERRORS as error:
                 response.message = " ".join(str(error).split())
+                response.success = False
+            except (
+                Exception
+            ) as error:  # Who asks gets an answer, and what the node holds is not lost.
+                if not rclpy.utilities.ok():
+                    raise
+                self._node.get_logger().error(traceback.format_exc())
+                response.message = (
+                    f"a fault of this software, please report it: {type(error).__name__}: {error}"
+                )
                 response.success = False
             if on_answer is not None:
                 on_answer(response.success, response.message)

@@ -17,9 +17,12 @@
 from __future__ import annotations
 
 import time
+import traceback
+from pathlib import Path
 from typing import Any
 
 import cv2
+import rclpy.utilities
 from rclpy.clock import Clock
 
 from semcal_ros.bridge.diagnostics import StreamStatistics
@@ -64,11 +67,11 @@ class Reporter:
 
     def info(self, text: str) -> None:
         """Log what a user may want to know."""
-        self._logger.info(text)
+        self._logger.info(_printable(text))
 
     def warn(self, text: str) -> None:
         """Log a warning."""
-        self._logger.warning(text)
+        self._logger.warning(_printable(text))
 
     def warn_seldom(self, text: str) -> None:
         """Log a warning unless the same one was logged in the last seconds."""
@@ -85,9 +88,28 @@ class Reporter:
 
     def reject(self, error: Exception) -> None:
         """Count an unusable message and log its reason, though not again and again."""
-        reason = " ".join(str(error).split())
+        reason = _printable(" ".join(str(error).split()))
         self.statistics.reject(reason)
         self.warn_seldom(reason)
+
+    def blame_itself(self, error: Exception) -> None:
+        """Count a message on which the node itself failed, and log where, though not again and again.
+
+        Raises
+        ------
+        Exception
+            The error itself where ROS is being shut down, which is no fault.
+        """
+        if not rclpy.utilities.ok():
+            raise error
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        file = "/".join(Path(place.filename).parts[-3:])
+        self.reject(
+            RuntimeError(
+                f"a fault of this software, please report it: {type(error).__name__}: {error} "
+                f"({file}, line {place.lineno})"
+            )
+        )
 
     def count_received(self) -> None:
         """Count a frame that has come in."""
@@ -101,3 +123,8 @@ class Reporter:
             if abs(latency_s) > _OTHER_CLOCK_S:
                 latency_s = None
         self.statistics.publish(time.monotonic(), latency_s)
+
+
+def _printable(text: str) -> str:
+    """The text for a log or a message, which are UTF-8: the name of a file need not be."""
+    return text.encode("utf-8", "backslashreplace").decode()

@@ -24,7 +24,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.serialization import deserialize_message
 
 from semcal_ros.bridge.compressed import decoded_image
 from semcal_ros.bridge.fields import stamp_ns_from_msg
@@ -38,6 +37,7 @@ from semcal_ros.core.errors import Rejection, SemcalError
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware import message_class
 from semcal_ros.nodes.common.context import NodeContext
+from semcal_ros.nodes.common.endpoints import unpack
 from semcal_ros.nodes.common.latest_worker import LatestWorker
 from semcal_ros.nodes.common.qos import glimpse_input
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
@@ -133,7 +133,7 @@ class CalibrationMonitor:
             return
         self._next_s = now_s + self._period_s
         try:
-            message = deserialize_message(data, self._type)
+            message = unpack(data, self._type)
             pixels, encoding = decoded_image(message)
             image = self._databar.cut(pixels)
             if image is None:

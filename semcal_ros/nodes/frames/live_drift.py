@@ -20,6 +20,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -83,6 +84,8 @@ DRIFT_PARAMETERS = (*_RESTARTING, _DETAIL, _MODE)
 # Turns (see LoadMonitor.turn_s) that a forecast may span: a few are normal, since measurements beside the stream
 # pause for twice as long as they take; many more mean a clock jump or a pause.
 _FAR = 20.0
+# That the stream waits for a measurement, which takes some 0.1 s: the process was stopped, or hangs.
+_PATIENCE_S = 10.0
 # Pause between measurements beside the stream, relative to the duration of one: they take at most a third of a CPU.
 _REST = 2.0
 
@@ -246,7 +249,7 @@ class LiveDrift:
             return
         done, self._at_work = self._at_work, None
         try:
-            self._keep(done.result())
+            self._keep(done.result(_PATIENCE_S))
             # The pause leaves the processor to other nodes.
             self._rest_until_s = time.monotonic() + _REST * self._load.cost_s
         except NODE_ERRORS as error:
@@ -254,17 +257,26 @@ class LiveDrift:
         except ChildProcessEnded as error:
             self._complain(f"the process that measures it {error}")
             self.reset()
+        except NoAnswer:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        self._complain("the process that measures it does not answer and is replaced")
+        self._process.abandon()
+        self.reset()
 
     def _fetch(self) -> None:
         """Get the tracker back into this process."""
         if not self._is_in_process:
             return
         try:
-            self._tracker = self._process.fetch().result()
+            self._tracker = self._process.fetch().result(_PATIENCE_S)
             self._is_in_process = False
         except ChildProcessEnded as error:
             self._complain(f"the process that measures it {error}")
             self.reset()
+        except NoAnswer:
+            self._give_up()
 
     def _complain(self, reason: str) -> None:
         # The frame was already published: it does not count as rejected.

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 import os
-import struct
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -35,13 +34,13 @@ from semcal_ros.bridge.fields import stamp_ns_from_msg
 from semcal_ros.config.config import IMAGE_TYPE, ImageConfig, MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.errors import InvalidValueError, MessageError
 from semcal_ros.core.rectification.line_phase import LinePhaseCorrector
 from semcal_ros.files.images.databar import DatabarCutter
 from semcal_ros.middleware import message_class, transport_advice
 from semcal_ros.nodes.common.base import SemNode
 from semcal_ros.nodes.common.context import NodeContext
-from semcal_ros.nodes.common.endpoints import Endpoints
+from semcal_ros.nodes.common.endpoints import Endpoints, read_stamp_ns
 from semcal_ros.nodes.common.parameters import ParameterDeclaration
 from semcal_ros.nodes.common.qos import image_input, stream_output
 from semcal_ros.nodes.common.reporter import NODE_ERRORS
@@ -174,9 +173,12 @@ class SourceTimestamps:
         )
 
     def _on_original(self, serialized: bytes, info: MessageInfo) -> None:
-        order = "<" if serialized[1] & 1 else ">"
-        seconds, nanoseconds = struct.unpack_from(f"{order}iI", serialized, _ENCAPSULATION)
-        self._times[seconds * _NS_PER_S + nanoseconds] = published_ns(info)
+        try:
+            stamp_ns = read_stamp_ns(serialized)
+        except MessageError:
+            # The node that made a frame of it, or could not, says so.
+            return
+        self._times[stamp_ns] = published_ns(info)
         while len(self._times) > _KEPT:
             self._times.popitem(last=False)
 
@@ -196,7 +198,7 @@ class FrameInput:
     context
         Of the node; among its parameters is ``mixed_frames`` unless ``keep_mixed`` is set.
     on_frame
-        Called with each frame; its exceptions of :data:`NODE_ERRORS` are counted.
+        Called with each frame; its exceptions are counted.
     magnification_config
         Returns the configuration with which magnifications are read; by default that of the node.
     topic, databar_rows
@@ -313,6 +315,10 @@ class FrameInput:
                 unused = "its magnification is not known"
         except NODE_ERRORS as error:
             self._reporter.reject(error)
+            unused = str(error)
+        except Exception as error:
+            # Whatever is wrong with one frame, the next one may be measured.
+            self._reporter.blame_itself(error)
             unused = str(error)
         self._unused = unused
         self._reporter.note("processing_ms", 1e3 * (time.monotonic() - started_s))

@@ -107,6 +107,11 @@ class DriftProcess:
         """Request the tracker in its state after all earlier requests."""
         return self._submit(None, None)
 
+    def abandon(self) -> None:
+        """Kill the process that does not answer; its futures raise, and the next request starts another one."""
+        if self._process is not None:
+            self._process.kill()
+
     def close(self) -> None:
         """End the process."""
         self._ended = True

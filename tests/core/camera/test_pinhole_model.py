@@ -63,3 +63,13 @@ def test_what_the_model_can_describe_is_described_exactly() -> None:
 
 def test_a_parallel_projection_has_none() -> None:
     assert fit_plumb_bob(replace(camera_of("jsm820"), rho=0.0), SIZE, SIZE) is None
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 96), (96, 1), (1, 1)])
+def test_an_image_of_one_line_tells_no_model(width: int, height: int) -> None:
+    assert fit_plumb_bob(camera_of("jsm820"), width, height) is None
+
+
+def test_a_distortion_that_folds_all_pixels_away_tells_no_model() -> None:
+    lost = replace(camera_of("jsm820"), ey=1e5)
+    assert fit_plumb_bob(lost, SIZE, SIZE) is None

@@ -118,6 +118,16 @@ def test_images_of_colours_and_images_too_small_are_taken() -> None:
     assert not estimate_line_phase(np.zeros((64, 64), dtype=np.uint8)).is_seen
 
 
+@pytest.mark.parametrize("width", [512, 640])
+def test_a_picture_whose_lines_are_alike_spoils_no_stream(width: int) -> None:
+    """The colour bars of a video grabber: they scatter by nothing, and a grain of rounding is no phase."""
+    bars = np.tile(np.repeat(np.arange(0, 256, 32, dtype=np.uint8), width // 8), (512, 1))
+    lines = LinePhaseCorrector(False)
+    for frame in [bars, bars, bars, *scene("gold")[0][:3]]:
+        lines.correct(frame)
+    assert not lines.phase.is_seen
+
+
 def test_a_stream_is_freed_of_it_and_tracked_as_without() -> None:
     frames, drift = scene("gold")
     lines, tracker = LinePhaseCorrector(True), DriftTracker()

@@ -19,13 +19,16 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from builtin_interfaces.msg import Time
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
-from std_msgs.msg import String
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header, String
 
-from semcal_ros.nodes.common.endpoints import PatientPublisher
+from semcal_ros.core.errors import MessageError
+from semcal_ros.nodes.common.endpoints import PatientPublisher, read_stamp_ns, unpack
 
 
 class Middleware:
@@ -52,6 +55,18 @@ def test_a_refused_message_is_published_once_there_is_room(monkeypatch: pytest.M
     middleware.publisher.publish("first")
     middleware.publisher.publish("second")
     assert middleware.taken == ["first", "second"]
+
+
+@pytest.mark.parametrize("length", [0, 3, 11, 30])
+def test_a_message_that_was_cut_off_is_refused(length: int) -> None:
+    data = serialize_message(Image(header=Header(stamp=Time(sec=3, nanosec=7)), encoding="mono8"))
+    assert read_stamp_ns(data) == 3_000_000_007
+    assert unpack(data, Image).encoding == "mono8"
+    with pytest.raises(MessageError, match=f"a serialized message of {length} bytes"):
+        unpack(data[:length], Image)
+    if length < 12:
+        with pytest.raises(MessageError, match="cannot be read"):
+            read_stamp_ns(data[:length])
 
 
 @pytest.mark.parametrize(("up", "calls"), [(True, 10), (False, 1)])

@@ -46,3 +46,33 @@ def test_a_latency_is_shown_unless_the_stamp_is_from_another_clock(
     reporter.count_published(Clock().now().nanoseconds - round(age_s * 1e9))
     assert notes(reporter)["published"] == "1"
     assert any("latency" in key for key in notes(reporter)) == shown
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_a_fault_of_the_node_is_counted_with_its_place_unless_ros_ends(
+    monkeypatch: pytest.MonkeyPatch, up: bool
+) -> None:
+    monkeypatch.setattr("rclpy.utilities.ok", lambda: up)
+    reporter, log = fake_reporter()
+    error = ZeroDivisionError("0.0 cannot be raised")
+    try:
+        raise error
+    except ZeroDivisionError:
+        pass
+    if not up:
+        with pytest.raises(ZeroDivisionError):
+            reporter.blame_itself(error)
+        return
+    for _ in range(3):
+        reporter.blame_itself(error)
+    assert notes(reporter)["rejected"] == "3"
+    assert len(log) == 1
+    assert "ZeroDivisionError: 0.0 cannot be raised" in log[0]
+    assert "nodes/common/test_reporter.py, line" in log[0]
+
+
+def test_the_name_of_a_file_need_not_be_utf_8() -> None:
+    reporter, log = fake_reporter()
+    reporter.reject(MessageError("caf\udce9.tif cannot be read"))
+    assert log == ["caf\\udce9.tif cannot be read"]
+    notes(reporter)["last_rejection"].encode()
