@@ -158,6 +158,24 @@ def test_distortion_that_no_parameter_describes(calibrated: CalibrationResult) -
     assert 0.02 < done.shape.rms_px < 0.08
 
 
+def test_a_distortion_that_turns_is_not_taken_for_what_the_calibration_does_not_know(
+    calibrated: CalibrationResult,
+) -> None:
+    """Spiral distortion, for which no change is tested: the centre and others explain some of it.
+
+    A principal point that is known to several px moves the image as a pose does, and that is no uncertainty of its
+    shape, also where distortion bends what a pose does.
+    """
+    middle, views = 0.5 * np.array(SEM.image_size), []
+    for view in simulated(SEM.camera_at, CHECKED, 43) + simulated(SEM.camera_at, CHECKED, 44):
+        out = (view.image_xy - middle) / middle[0]
+        turned = out[:, ::-1] * [-1.0, 1.0] * np.sum(out**2, axis=1, keepdims=True)
+        views.append(replace(view, image_xy=view.image_xy + 1.0 * turned))
+    done = check(calibrated, views)
+    assert done.shape.stated_px < 0.02
+    assert done.shape.significant
+
+
 def test_one_view_cannot_tell_a_tilt_from_an_aspect(calibrated: CalibrationResult) -> None:
     (view, *_) = simulated(changed(aspect=0.002), (2000.0,), 33)
     blind = replace(view, stage=None)

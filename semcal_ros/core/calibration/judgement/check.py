@@ -260,8 +260,16 @@ def _stated_px(model: CalibrationModel, setup: Setup) -> float:
     x, y = np.meshgrid(*(np.linspace(0.0, n - 1.0, 7) for n in setup.image_size))
     lattice: Array = np.stack([x.ravel(), y.ravel()], axis=1)
     jacobian = camera.project_jacobian(camera.sem_from_ideal(lattice))
-    known = np.isfinite(jacobian).all(axis=(1, 2))
-    # A pose moves the image by a homography; here its derivative, for x and y in turn.
+    # Raw per ideal px, by central differences: what a pose does comes before the distortion.
+    raw_from_ideal = np.stack(
+        [
+            camera.distort(lattice + step) - camera.distort(lattice - step)
+            for step in 0.5 * np.eye(2)
+        ],
+        axis=2,
+    )
+    known = np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(raw_from_ideal).all(axis=(1, 2))
+    # A pose moves the ideal image by a homography; here its derivative, for x and y in turn.
     x, y = (lattice[known] / camera.width - 0.5).T
     one, zero = np.ones_like(x), np.zeros_like(x)
     moves = np.stack(
@@ -270,7 +278,8 @@ def _stated_px(model: CalibrationModel, setup: Setup) -> float:
             np.stack([zero, zero, zero, one, x, y, x * y, y * y], axis=1),
         ],
         axis=1,
-    ).reshape(2 * len(x), 8)
+    )
+    moves = (raw_from_ideal[known] @ moves).reshape(2 * len(x), 8)
     basis, _ = np.linalg.qr(moves)
     rows = jacobian[known].reshape(2 * len(x), -1)
     left = rows - basis @ (basis.T @ rows)
