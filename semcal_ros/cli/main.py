@@ -18,11 +18,16 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
+from copy import copy
+from functools import wraps
 from importlib import import_module
+from typing import Any
 
 import click
 
 import semcal_ros
+from semcal_ros.cli.options import find_lost_input
 from semcal_ros.core.errors import SemcalError, UnusableCalibrationError
 from semcal_ros.core.wording import did_you_mean
 from semcal_ros.middleware import add_environment_prefix
@@ -70,7 +75,9 @@ class _Group(click.Group):
                 expected="the packages of requirements/base.txt, in versions that fit each other",
                 do="run `make setup`, or reinstall them",
             ) from error
-        command: click.Command = module.command
+        command: click.Command = copy(module.command)
+        if command.callback is not None:
+            command.callback = _sparing_inputs(command.callback)
         return command
 
     def resolve_command(
@@ -87,6 +94,25 @@ class _Group(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(sorted(_COMMANDS.items()))
+
+
+def _sparing_inputs(callback: Callable[..., Any]) -> Callable[..., Any]:
+    """What a command does, unless it would write over a file that it reads."""
+
+    @wraps(callback)
+    def call(*given: Any, **named: Any) -> Any:
+        context = click.get_current_context()
+        found = find_lost_input(context)
+        if found is not None:
+            output, source = found
+            raise SemcalError(
+                f"{output} is also an input of this command ({source})",
+                expected="an output of its own",
+                do="choose another name",
+            )
+        return callback(*given, **named)
+
+    return call
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -121,8 +147,9 @@ def main(args: list[str] | None = None) -> int:
         return _refuse(str(error), status=1)
     except SemcalError as error:
         return _refuse(str(error))
-    except BrokenPipeError:
-        return 0  # the reader of the output has closed the pipe
+    except (BrokenPipeError, SystemExit):
+        # The reader of the output has closed the pipe, at which click exits by itself.
+        return 0
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         return _refuse(f"{name}{error.strerror or error}")

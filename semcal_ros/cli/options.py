@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -162,6 +163,60 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON, 
 def output_option(text: str) -> Callable[[Command], Command]:
     """The required ``-o`` with its help text."""
     return click.option("-o", "--output", required=True, type=PATH, help=text)
+
+
+# Options that name files to be written, by their parameters; and the input that its command may replace.
+_WRITTEN = frozenset(
+    [
+        "output",
+        "table",
+        "figure",
+        "plot",
+        "video",
+        "report",
+        "strip",
+        "record",
+        "cloud",
+        "sigma",
+        "extended",
+    ]
+)
+_REPLACED = frozenset({("update", "calibration"), ("extend", "calibration")})
+
+
+def find_lost_input(context: click.Context) -> tuple[str, str] | None:
+    """Find an output of a command that is one of the files it reads, by whatever name: the option, and the input.
+
+    The calibration that ``update`` and ``extend`` renew may be replaced.
+    """
+    written, read = [], []
+    for parameter in context.command.params:
+        value = context.params.get(parameter.name or "")
+        for one in value if isinstance(value, (tuple, list)) else (value,):
+            if not isinstance(one, (str, Path)) or not os.path.isfile(one):
+                continue
+            if isinstance(parameter, click.Option) and parameter.name in _WRITTEN:
+                written.append((parameter.opts[0], one))
+            elif (context.info_name, parameter.name) not in _REPLACED:
+                read.append((parameter.human_readable_name, one))
+    for option, path in written:
+        for name, source in read:
+            if os.path.samefile(path, source):
+                return f"{option} {path}", name
+    return None
+
+
+class FiniteRange(click.FloatRange):
+    """A number within limits, and no infinity or NaN."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Extend the base class: refuse what is not finite, which no comparison does."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number", param, ctx)
+        return number
 
 
 def parse_ratio(
@@ -435,7 +490,7 @@ KINDS: dict[str, Kind] = {
         Quantity("time", "s", "3s or 500ms", within=(0.1, 3600.0)),
         write=lambda s: f"{s:g}s",
     ),
-    "factor": Kind(type=click.FloatRange(min=0.0, min_open=True)),
+    "factor": Kind(type=FiniteRange(min=0.0, min_open=True)),
     "image size": Kind("WxH", parse=_parse_size),
     "time ahead": Kind("TIME", Quantity("time", "s", "5s or 500ms", within=(0.0, 1e6))),
     "lengths": Kind("LENGTH,...", parse=parse_lengths),
@@ -486,7 +541,7 @@ def make_option(field: OptionField) -> Callable[[Command], Command]:
     elif not option.kind and option.repeated:
         settings["type"] = get_args(plain)[0]
     elif not option.kind and option.between:
-        limits: Any = click.IntRange if plain is int else click.FloatRange
+        limits: Any = click.IntRange if plain is int else FiniteRange
         settings["type"] = limits(*option.between)
     elif not option.kind:
         settings["type"] = plain

@@ -55,7 +55,8 @@ def show_progress(first: str = "opening") -> Iterator[Callable[[str, int, int | 
     first
         What is done before the workflow names a stage.
     """
-    if not sys.stderr.isatty():
+    # Closed, it is None.
+    if sys.stderr is None or not sys.stderr.isatty():
         yield lambda _stage, _done, _total: None
         return
     shown = _ProgressBar(first)

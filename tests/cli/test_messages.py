@@ -16,15 +16,20 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import pytest
 
 from semcal_ros.cli import main
-from semcal_ros.cli.output import echo_rejected
+from semcal_ros.cli.output import echo_rejected, show_progress
 from semcal_ros.core.calibration.views import RejectedView, ViewStatus
 from semcal_ros.core.errors import Rejection
+from tests.helpers.node_scenes import make_calibration
 
 
 @pytest.mark.parametrize(
@@ -91,3 +96,68 @@ def test_a_number_that_is_too_large_is_not_called_negative(
 ) -> None:
     assert main(["drift", "x", "-o", "d.csv", *option.split()]) == 2
     assert reason in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("how", ["itself", "a symbolic link", "a hard link"])
+@pytest.mark.parametrize("command", ["export", "calibrate", "import-calibration"])
+def test_no_output_writes_over_a_file_that_is_read(
+    command: str, how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read, written = tmp_path / "read.yaml", tmp_path / "written.yaml"
+    make_calibration().save(read)
+    before = read.read_bytes()
+    if how == "itself":
+        written = read
+    elif how == "a hard link":
+        written.hardlink_to(read)
+    else:
+        written.symlink_to(read)
+    arguments: dict[str, list[object]] = {
+        "export": [read, "--format", "ros", "--magnification", "1000"],
+        "calibrate": [tmp_path, "--config", read],
+        "import-calibration": [read, "--image-size", "64x64"],
+    }
+    assert main([str(a) for a in (command, *arguments[command], "-o", written)]) == 2
+    assert "is also an input of this command" in capsys.readouterr().err
+    assert read.read_bytes() == before
+
+
+def test_the_calibration_that_is_renewed_may_be_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = tmp_path / "cal.yaml"
+    make_calibration().save(calibration)
+    assert main(["update", str(calibration), str(tmp_path / "none"), "-o", str(calibration)]) == 2
+    assert "none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+def test_numbers_that_are_not_finite_are_refused(
+    number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", str(tmp_path / "bag"), "--blur", number]) == 2
+    assert "--blur" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_reader_who_has_seen_enough_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a closed pipe, click ends the process with the status of a failure."""
+
+    def write(*_: object, **__: object) -> None:
+        raise OSError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(click, "echo", write)
+    monkeypatch.setattr("semcal_ros.cli.info_command.click.echo", write)
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    calibration = tmp_path / "cal.yaml"
+    make_calibration().save(calibration)
+    assert main(["info", str(calibration)]) == 0
+
+
+def test_a_closed_stderr_keeps_no_command_from_its_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    with show_progress() as on_progress:
+        on_progress("reading", 1, 2)

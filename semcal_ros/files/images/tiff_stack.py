@@ -22,6 +22,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import struct
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -39,6 +40,9 @@ from numpy.typing import NDArray
 from semcal_ros.core.errors import BagError, InvalidValueError, TiffError
 from semcal_ros.files.images.metadata import parse_xml, quantity
 from semcal_ros.files.tiff.read import MAX_PIXELS, MAX_SIDE_PX, grey_image, open_tiff
+
+# What files say that this package has written them.
+_SOFTWARE = "semcal_ros"
 
 _MAX_PAGES = 100_000
 _MAX_BYTES = 8
@@ -306,7 +310,7 @@ class OmeTiffWriter:
             contiguous=bool(self._stamps_ns),
             description=None if self._stamps_ns else "-",
             datetime=None if self._stamps_ns else _utc(stamp_ns),
-            software=None if self._stamps_ns else "semcal_ros",
+            software=None if self._stamps_ns else _SOFTWARE,
             resolution=(per_cm, per_cm),
             resolutionunit="CENTIMETER",
             metadata=None,
@@ -327,7 +331,7 @@ class OmeTiffWriter:
         count = len(self._stamps_ns)
         height, width = self._shape[:2]
         samples = self._shape[2] if len(self._shape) == 3 else 1
-        xml = tifffile.OmeXml(Creator="semcal_ros")
+        xml = tifffile.OmeXml(Creator=_SOFTWARE)
         xml.addimage(
             self._dtype,
             (count, *self._shape),
@@ -347,6 +351,16 @@ class OmeTiffWriter:
         """Close the file, finished or not."""
         with contextlib.suppress(OSError):
             self._file.close()
+
+
+def is_from_semcal(path: Path) -> bool:
+    """Whether a TIFF says that this package has written it; not so if it cannot be read."""
+    try:
+        with tifffile.TiffFile(path) as file:
+            tag = file.pages.first.tags.get("Software")
+    except (OSError, ValueError, struct.error, tifffile.TiffFileError):
+        return False
+    return tag is not None and tag.value == _SOFTWARE
 
 
 def _describe(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:

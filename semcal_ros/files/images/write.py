@@ -33,7 +33,12 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import BagError, InvalidValueError
 from semcal_ros.files.atomic import atomic_write_bytes
 from semcal_ros.files.images.scale_bar import add_databar, choose_scale_bar
-from semcal_ros.files.images.tiff_stack import DATABAR_ROWS, OmeTiffWriter, open_ome_tiff
+from semcal_ros.files.images.tiff_stack import (
+    DATABAR_ROWS,
+    OmeTiffWriter,
+    is_from_semcal,
+    open_ome_tiff,
+)
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 IMAGE_SUFFIXES = (*TIFF_SUFFIXES, ".png")
@@ -218,7 +223,7 @@ def open_image_folder(
     path
         The folder.
     overwrite
-        Whether to replace an existing folder that holds nothing but TIFFs.
+        Whether to replace an existing folder that holds nothing but TIFFs which this package has written.
     databar
         As for :func:`write_image`.
 
@@ -256,12 +261,13 @@ def _check_replaceable(path: Path, overwrite: bool) -> None:
         raise BagError(
             f"{path} exists", expected="a new folder", do="choose another name, or --overwrite"
         )
-    only_tiffs = path.is_dir() and all(
-        item.is_file() and item.suffix.lower() in TIFF_SUFFIXES for item in path.iterdir()
+    replaceable = path.is_dir() and all(
+        item.is_file() and item.suffix.lower() in TIFF_SUFFIXES and is_from_semcal(item)
+        for item in path.iterdir()
     )
-    if path.is_symlink() or not only_tiffs:
+    if path.is_symlink() or not replaceable:
         raise BagError(
-            f"{path} holds something other than TIFFs, so it is not replaced",
-            expected="a new path, or a folder of TIFFs",
+            f"{path} holds something other than TIFFs of semcal, so it is not replaced",
+            expected="a new path, or a folder of TIFFs that semcal has written",
             do="choose another name or remove it yourself",
         )

@@ -134,6 +134,14 @@ def test_what_cannot_be_planned_is_refused(poor: CalibrationModel) -> None:
         plan_views(poor, 0.01, squares_m=())
 
 
+def test_squares_larger_than_every_field_are_refused(poor: CalibrationModel) -> None:
+    with pytest.raises(InvalidValueError, match=r"squares of 5e\+03 um, of which no magnification"):
+        plan_views(poor, 1e-3, squares_m=(5e-3,))
+    # At the lowest magnification a few corners show, at the others none.
+    some = plan_views(poor, 1e-4, squares_m=(2.5e-4,), most_visits=2)
+    assert all(visit.magnification < 300.0 for visit in some.visits)
+
+
 def test_the_verdict_names_the_weakest_place_and_the_next_visit(poor: CalibrationModel) -> None:
     known = replace(poor, record=replace(poor.record, squares_m=SQUARES_M))
     verdict = judge_calibration(known)

@@ -118,6 +118,14 @@ def test_a_folder_has_a_file_per_image(tmp_path: Path) -> None:
     with open_image_folder(tmp_path / "out", overwrite=True) as folder:
         folder.write(GREY, START_NS, SCALE)
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["frame_000001.tif"]
+    # As a microscope saves it: a TIFF, and not from here.
+    cv2.imwrite(str(tmp_path / "out" / "hers.tif"), GREY)
+    with (
+        pytest.raises(BagError, match="other than TIFFs of semcal"),
+        open_image_folder(tmp_path / "out", overwrite=True),
+    ):
+        pass
+    (tmp_path / "out" / "hers.tif").unlink()
     (tmp_path / "out" / "notes.txt").write_text("hers")
     foreign = pytest.raises(BagError, match="something other than TIFFs")
     with foreign, open_image_folder(tmp_path / "out", overwrite=True):

@@ -169,7 +169,16 @@ def plan_views(
         _visit_information(model, float(g), square)
         for g, square in zip(candidates, seen, strict=True)
     ]
-    gains = [d.T @ i @ d for d, i in zip(designs, information, strict=True)]
+    if all(i is None for i in information):
+        raise InvalidValueError(
+            f"squares of {', '.join(f'{1e6 * s:.3g} um' for s in squares_m)}, of which no magnification shows corners",
+            expected="squares of which several fit into the field of view",
+            do="name the squares that the grid has",
+        )
+    gains = [
+        np.zeros((root.shape[1],) * 2) if i is None else d.T @ i @ d
+        for d, i in zip(designs, information, strict=True)
+    ]
     precision = np.eye(root.shape[1])
 
     def judge(matrix: Array) -> tuple[float, int]:
@@ -229,8 +238,10 @@ def _square_for(camera: ScanCamera, squares_m: Sequence[float]) -> float:
     return max(fitting) if fitting else min(squares_m)
 
 
-def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Array:
-    """(P, P) information of a visit on the camera, all that is not the camera eliminated."""
+def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Array | None:
+    """(P, P) information of a visit on the camera, all that is not the camera eliminated; None where no view shows
+    enough corners.
+    """
     camera = replace(model.at(g), residual=None)
     usual = Priors()
     heights = record_of(model, usual)
@@ -250,12 +261,17 @@ def _visit_information(model: CalibrationModel, g: float, square_m: float) -> Ar
         xy = camera.project(points)
         inside = np.all((xy >= 0.0) & (xy <= (camera.width - 1.0, camera.height - 1.0)), axis=1)
         sigmas = np.full(int(inside.sum()), PLANNED_SIGMA_PX)
+        if np.sum(inside) < 4:
+            # Fewer tell no pose.
+            continue
         view = GridView(g, board[inside], xy[inside], sigmas, square_m=square_m)
         if of_lines:
             along = camera.project(points + step * rotation[:, 1]) - xy
             view = _as_lines(view, along[inside], unknown_px=camera.width)
         views.append(view)
         rotations.append(rotation)
+    if not views:
+        return None
     problem = make_problem(
         views,
         np.array([g]),
