@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -77,7 +79,7 @@ class _Group(click.Group):
             ) from error
         command: click.Command = copy(module.command)
         if command.callback is not None:
-            command.callback = _sparing_inputs(command.callback)
+            command.callback = _guarded(command.callback)
         return command
 
     def resolve_command(
@@ -96,8 +98,8 @@ class _Group(click.Group):
             formatter.write_dl(sorted(_COMMANDS.items()))
 
 
-def _sparing_inputs(callback: Callable[..., Any]) -> Callable[..., Any]:
-    """What a command does, unless it would write over a file that it reads."""
+def _guarded(callback: Callable[..., Any]) -> Callable[..., Any]:
+    """What a command does, unless it would write over a file that it reads; until nobody reads its output any more."""
 
     @wraps(callback)
     def call(*given: Any, **named: Any) -> Any:
@@ -110,7 +112,13 @@ def _sparing_inputs(callback: Callable[..., Any]) -> Callable[..., Any]:
                 expected="an output of its own",
                 do="choose another name",
             )
-        return callback(*given, **named)
+        try:
+            return callback(*given, **named)
+        except BrokenPipeError:
+            # The reader of the output has seen enough; click would exit as if the command had failed.
+            with contextlib.suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
 
     return call
 
@@ -147,9 +155,6 @@ def main(args: list[str] | None = None) -> int:
         return _refuse(str(error), status=1)
     except SemcalError as error:
         return _refuse(str(error))
-    except (BrokenPipeError, SystemExit):
-        # The reader of the output has closed the pipe, at which click exits by itself.
-        return 0
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         return _refuse(f"{name}{error.strerror or error}")
