@@ -200,9 +200,11 @@ WORN_RATIO = TABLE.stated(
     "Of what a frame leaves unexplained to the least that one has left: beyond it, half of its square is of a specimen "
     "that has changed since.",
 )
-WORN_FRAMES = TABLE.stated(
+WORN_FRAMES = TABLE.measured(
     "WORN_FRAMES", 3, "frames",
-    "In a row beyond it, after which the keyframe is replaced: a flash or a bad frame passes.",
+    "In a row beyond it, after which the keyframe is replaced: a flash or a bad frame passes. With 4 or 2, 27 cases "
+    "are decided alike, and errors change by 0.6 % at most.",
+    command=TRIED,
 )
 MERGED_CORRELATION_MIN = TABLE.measured(
     "MERGED_CORRELATION_MIN", 0.85, "correlation",
