@@ -95,7 +95,9 @@ def parse_calibration(text: str, *, source: str = "calibration") -> CalibrationM
     try:
         _check_kind(data, source)
         _check_schema(data, source)
+        _check_whole_numbers(data)
         model = CalibrationModel(**_read_fields(data))
+        _check_range(model)
         _check_cameras(model)
     except (ValueError, ArithmeticError) as error:
         # YAML allows integers of any length, and floats whose products overflow.
@@ -314,6 +316,32 @@ def _check_finite(values: Sequence[Any]) -> list[float]:
     if not np.all(np.isfinite(numbers)):
         raise InvalidValueError("numbers that are not finite", expected="finite numbers")
     return numbers
+
+
+def _check_whole_numbers(data: Any) -> None:
+    """Refuse those that are of no use and that numpy takes for objects."""
+    if isinstance(data, Mapping):
+        data = list(data.values())
+    if isinstance(data, list):
+        for part in data:
+            _check_whole_numbers(part)
+    elif isinstance(data, int) and abs(data) >= 2**63:
+        raise InvalidValueError(f"a whole number of {len(str(abs(data)))} digits")
+
+
+def _check_range(model: CalibrationModel) -> None:
+    """Refuse magnifications at which the functions were never fitted, which would pass for calibrated ones."""
+    if model.ladder is not None:
+        # It has extended both.
+        return
+    low, high = model.magnification_range
+    for name, function in model.functions.items():
+        first, last = function.g_range
+        if low < first * (1.0 - 1e-9) or high > last * (1.0 + 1e-9):
+            raise InvalidValueError(
+                f"magnifications of {low:g} to {high:g}, and {name} of {first:g} to {last:g}",
+                expected="functions of all magnifications",
+            )
 
 
 def _check_cameras(model: CalibrationModel) -> None:

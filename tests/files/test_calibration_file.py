@@ -220,6 +220,9 @@ def _broken(calibration, edit):
         (lambda d: d["covariance"]["upper_rows"][0].__setitem__(1, 1e6), "correlations"),
         (lambda d: d["covariance"]["upper_rows"][0].__setitem__(1, 1e308), "correlations"),
         (lambda d: d.update(surprise=1), "surprise"),
+        (lambda d: d["magnifications"].append(1e6), "to 1e[+]06, and scale of"),
+        (lambda d: d["magnifications"].insert(0, 1.0), "magnifications of 1 to"),
+        (lambda d: d["scale_sigma"].update(repeatability=10**25), "a whole number of 26 digits"),
     ],
 )
 def test_wrong_files_are_refused_in_one_line(calibration, edit, message):
