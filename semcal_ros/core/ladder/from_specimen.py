@@ -29,6 +29,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, check_positive, check_range
 from semcal_ros.core.calibration.stage import fit_stage_moves
+from semcal_ros.core.calibration.thresholds import DISPLAY_WIDTH_LIMITS_M
 from semcal_ros.core.camera.calibration_model import CalibrationModel, ScaleSigma, columns_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.camera.records import LadderRecord
@@ -327,6 +328,13 @@ def calibrate_from_specimen(
                 f"a length in picture {known.picture} of {len(pictures)}",
                 expected=f"0 to {len(pictures) - 1}",
             )
+        size = pictures[known.picture].image.shape[1::-1]
+        ends = np.array([known.start_xy, known.end_xy])
+        if not np.all((ends >= 0.0) & (ends <= np.subtract(size, 1))):
+            raise InvalidValueError(
+                f"a length from pixel {known.start_xy} to {known.end_xy} of a picture of {size[0]} x {size[1]} px",
+                expected="two pixels of the picture",
+            )
         at = pictures[known.picture].magnification
         # Any scale: the length corrects it when the distortion is known.
         anchor = ScaleAnchor(display_width_m / at / pictures[0].image.shape[1], at, known.sigma)
@@ -335,6 +343,7 @@ def calibrate_from_specimen(
             f"a pixel size at {anchor.magnification:g}x for pictures from {seen[0]:g}x to {seen[-1]:g}x",
             expected="one at a magnification of that range",
         )
+    _check_display_width(anchor, pictures[0].image.shape[1])
     start = _unknown_microscope(pictures[0].image.shape, seen, anchor, display_width_m)
     measured = measure_ladder(
         start, pictures, timing=timing, on_progress=on_progress, calibrated=False
@@ -344,6 +353,7 @@ def calibrate_from_specimen(
         anchor = known.as_anchor(model, anchor.magnification)
     elif isinstance(known, StageMoves):
         anchor = known.as_anchor(measured, measured.numbers)
+    _check_display_width(anchor, pictures[0].image.shape[1])
     model = _anchored(model, anchor)
     steps = describe_steps(measured)
     weaknesses = (*find_unrest(measured), *_find_weaknesses(steps, anchor, model))
@@ -359,6 +369,19 @@ def calibrate_from_specimen(
     }
     model = replace(model, statistics=statistics)
     return SpecimenCalibration(model, steps, measured.rejected, measured.unused, weaknesses)
+
+
+def _check_display_width(anchor: ScaleAnchor, width_px: int) -> None:
+    """Refuse a known size that no microscope has: as a rule, another unit."""
+    width_m = anchor.pixel_size_m * anchor.magnification * width_px
+    low, high = DISPLAY_WIDTH_LIMITS_M
+    if not low <= width_m <= high:
+        raise InvalidValueError(
+            f"a pixel size of {1e9 * anchor.pixel_size_m:.3g} nm at {anchor.magnification:g}x, that is, a display of "
+            f"{width_m:.3g} m",
+            expected=f"one of {low:g} to {high:g} m",
+            do="check the unit of the known size, and the magnification",
+        )
 
 
 def _unknown_microscope(

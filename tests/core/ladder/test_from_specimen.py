@@ -102,6 +102,16 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         calibrate_from_specimen(
             [_blank(5000.0), _blank(7000.0), _blank(10000.0)], far, display_width_m=0.1
         )
+    ladder = [_blank(5000.0), _blank(7000.0), _blank(10000.0)]
+    for pixel_size_m in (1e-13, 1e-2):
+        with pytest.raises(InvalidValueError, match=r"that is, a display of .* m; expected"):
+            calibrate_from_specimen(
+                ladder, ScaleAnchor(pixel_size_m, 5000.0, 0.01), display_width_m=0.1
+            )
+    for end in ((SIZE - 0.5, 10.0), (10.0, -1.0), (10.0, math.nan)):
+        outside = KnownLength(1e-6, 0, (40.0, 60.0), end, 0.01)
+        with pytest.raises(InvalidValueError, match="expected two pixels of the picture"):
+            calibrate_from_specimen(ladder, outside, display_width_m=0.1)
     with pytest.raises(InvalidValueError, match="length of 5 px"):
         KnownLength(1e-6, 0, (10.0, 10.0), (13.0, 14.0), 0.01)
     with pytest.raises(InvalidValueError, match="sigma"):
