@@ -44,6 +44,13 @@ def rounded_magnification(g: float) -> str:
     return f"{g:.0f}x" if g >= 10.0 else f"{g:.3g}x"
 
 
+def format_length(length_m: float) -> str:
+    """Format a length as options take it, such as ``25.1mm``."""
+    units = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+    unit, size_m = next((u for u in units if length_m >= u[1]), units[-1])
+    return f"{float(f'{length_m / size_m:.4g}'):g}{unit}"
+
+
 def in_nm(length_m: float) -> str:
     """Return a length to two digits in nm, without an exponent; those of photographs in um."""
     factor, unit = (1e9, "nm") if abs(length_m) < 1e-4 else (1e6, "um")

@@ -53,7 +53,7 @@ from semcal_ros.core.errors import (
     SemcalError,
     UnusableCalibrationError,
 )
-from semcal_ros.core.wording import counted
+from semcal_ros.core.wording import counted, format_length
 from semcal_ros.files.recordings import RecordedFrame
 from semcal_ros.workflows.find_grid import (
     PATTERN,
@@ -178,8 +178,8 @@ def _check_stated_scale(collected: CollectedViews) -> None:
             "of 2: state --pattern"
         )
     raise UnusableCalibrationError(
-        f"{pattern} {1e9 * side:.4g} nm apart by squares_m, and {1e9 * side * factor:.4g} nm apart by the stated pixel "
-        f"sizes (a factor of {factor:.4g}, the same in all views within {100.0 * (spread - 1.0):.2g} %)",
+        f"{pattern} {format_length(side)} apart by squares_m, and {format_length(side * factor)} apart by the stated "
+        f"pixel sizes (a factor of {factor:.4g}, the same in all views within {100.0 * (spread - 1.0):.2g} %)",
         expected=f"two readings of the scale within {100.0 * (_STATED_WITHIN - 1.0):.0f} % of each other",
         do=advice
         + "; where the stated pixel sizes mean nothing, give --display-width or --magnification instead",

@@ -64,8 +64,7 @@ from semcal_ros.core.calibration.views import GridView, add_excess_noise
 from semcal_ros.core.camera.calibration_model import stack_coefficients, with_coefficients
 from semcal_ros.core.camera.plane_geometry import fit_homography, view_affine
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
-
-_UNITS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+from semcal_ros.core.wording import format_length
 
 
 def observed_scale_factor(views: Sequence[GridView], nominal_px_per_m: Array) -> float:
@@ -98,14 +97,14 @@ def advise_scale(
     width_m = display_width_m / factor
     ways = []
     if DISPLAY_WIDTH_LIMITS_M[0] <= width_m <= DISPLAY_WIDTH_LIMITS_M[1]:
-        ways.append(f"--display-width {_format_length(width_m)}")
+        ways.append(f"--display-width {format_length(width_m)}")
     if pixel_size_m is not None:
-        size = _format_length(pixel_size_m / factor)
+        size = format_length(pixel_size_m / factor)
         ways.append(f"--pixel-size {size} in place of a magnification or another pixel size")
     fitting = ", or ".join(ways) or f"magnifications {factor:.4g} times as large"
     if not squares_m:
         return f"give {fitting} (display_width_m in a configuration)"
-    sides = ",".join(_format_length(factor * side) for side in sorted(set(squares_m), reverse=True))
+    sides = ",".join(format_length(factor * side) for side in sorted(set(squares_m), reverse=True))
     return (
         f"if the squares are right, give {fitting}; if the magnification is, give --squares {sides} "
         "(display_width_m and squares_m in a configuration)"
@@ -139,10 +138,10 @@ def check_nominal_scale(
     """
     if not is_scale_far(np.array(factor)):
         return
-    sides = " and ".join(_format_length(side) for side in sorted(set(squares_m), reverse=True))
+    sides = " and ".join(format_length(side) for side in sorted(set(squares_m), reverse=True))
     raise UnusableCalibrationError(
         f"images that show {factor:.3g} times the scale that a display width of "
-        f"{_format_length(display_width_m)}"
+        f"{format_length(display_width_m)}"
         + (f" and squares of {sides}" if sides else "")
         + " predict",
         expected=f"a scale within a factor of {SCALE_FACTOR_MAX:g} of the predicted one",
@@ -171,14 +170,8 @@ def check_square_sides(factor: float, display_width_m: float) -> None:
         f"{display_width_m:g} m predict",
         expected="squares_m to hold the sides of single squares, not the period of the grid",
         do=f"correct squares_m (--squares), or if that is right, set display_width_m to {width_m:.4g} m "
-        f"(--display-width {_format_length(width_m)})",
+        f"(--display-width {format_length(width_m)})",
     )
-
-
-def _format_length(length_m: float) -> str:
-    """Format a length as options take it, such as ``25.1mm``."""
-    unit, size_m = next((u for u in _UNITS if length_m >= u[1]), _UNITS[-1])
-    return f"{float(f'{length_m / size_m:.4g}'):g}{unit}"
 
 
 def align_lattices(setup: Setup) -> Setup:

@@ -182,7 +182,7 @@ def _scale_parts(
     if stretch <= 0.0:
         raise InvalidValueError(
             f"a height of {1e3 * height_m:g} mm",
-            expected=f"one below the pivot of the scan at {-1e3 / camera.rho:.3g} mm",
+            expected=f"one of more than {-1e3 / camera.rho:.3g} mm, where the pivot of the scan lies",
         )
     rectified, sigma = camera.rectified, model.scale_sigma
     total = max(rectified.pixel_size_sigma_m) / rectified.pixel_size_m[0]

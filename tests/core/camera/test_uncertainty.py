@@ -82,7 +82,7 @@ def test_a_higher_specimen_has_the_pixel_size_of_the_projection(model: Calibrati
     budget = budget_of_pixel_size(model, g, height_m=height_m)
     assert budget.value_m == pytest.approx(2e-6 / length_px, rel=1e-9)
     assert "distance of the scan pivot" in by_source(budget)
-    with pytest.raises(InvalidValueError, match="below the pivot"):
+    with pytest.raises(InvalidValueError, match="where the pivot of the scan lies"):
         budget_of_pixel_size(model, g, height_m=-2.0 / camera.rho)
 
 
