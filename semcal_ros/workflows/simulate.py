@@ -102,7 +102,7 @@ class SimulationOptions:
         float | None, Option("Electrons per pixel; 0 for no shot noise.", between=(0, None))
     ] = None
     blur_px: Annotated[float | None, Option("Sigma of the beam in px.", between=(0, None))] = None
-    seed: Annotated[int, Option("Seed of poses, specimen and noise.")] = 0
+    seed: Annotated[int, Option("Seed of poses, specimen and noise.", between=(0, None))] = 0
     stage: Annotated[SimulatedStage | None, Keyword("Faults of the stage; None: perfect.")] = _STAGE
     grid: Annotated[GridFaults | None, Keyword("Faults of the grid; None: perfect.")] = TYPICAL_GRID
     overwrite: Annotated[bool, OVERWRITE] = False
