@@ -204,6 +204,13 @@ def _reading(command: Command, *, several: bool, required: bool = True) -> Comma
             for part in (_split(paths) if several else [paths] * bool(paths))
         ]
         if display_width is not None:
+            calibration = click.get_current_context().params.get("calibration")
+            if calibration is not None and any(is_bag(path) for path in paths):
+                raise InvalidValueError(
+                    "--display-width beside a calibration, for a bag",
+                    expected="one of them: the magnifications of a bag are those of the calibration",
+                    do="leave it out",
+                )
             microscope = replace(microscope, display_width_m=display_width)
         recordings = (
             {"recordings": given} if several else {"recording": given[0] if given else None}

@@ -161,3 +161,20 @@ def test_a_closed_stderr_keeps_no_command_from_its_work(monkeypatch: pytest.Monk
     monkeypatch.setattr(sys, "stderr", None)
     with show_progress() as on_progress:
         on_progress("reading", 1, 2)
+
+
+@pytest.mark.parametrize("command", ["drift", "check", "rectify"])
+def test_a_display_width_that_would_do_nothing_is_refused(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration, bag = tmp_path / "cal.yaml", tmp_path / "bag"
+    make_calibration().save(calibration)
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    given: list[object] = [command, bag, "--display-width", "127mm"]
+    if command == "check":
+        given.insert(1, calibration)
+    else:
+        given += ["--calibration", calibration, "-o", tmp_path / "out.csv"]
+    assert main([str(a) for a in given]) == 2
+    assert "--display-width beside a calibration" in capsys.readouterr().err
