@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import wraps
@@ -290,7 +291,9 @@ def check_spared(option: str, path: Path, recording: RecordedFiles) -> None:
     InvalidValueError
         The output belongs to the recording.
     """
-    if any(_belongs(path.resolve(), source.resolve()) for source in recording.paths):
+    # Not Path.resolve, which raises RuntimeError where a link leads to itself.
+    target = Path(os.path.realpath(path))
+    if any(_belongs(target, Path(os.path.realpath(source))) for source in recording.paths):
         raise InvalidValueError(
             f"{option} {path} belongs to the recording", expected="a file or folder outside it"
         )

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import errno
 import io
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -178,3 +179,20 @@ def test_a_display_width_that_would_do_nothing_is_refused(
         given += ["--calibration", calibration, "-o", tmp_path / "out.csv"]
     assert main([str(a) for a in given]) == 2
     assert "--display-width beside a calibration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a link to itself"])
+@pytest.mark.parametrize("command", ["info", "stack"])
+def test_what_cannot_be_read_at_all_is_refused_at_once(
+    command: str, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "picture.tif"
+    if kind == "a pipe":
+        os.mkfifo(picture)
+    else:
+        picture.symlink_to(picture)
+    output = ["-o", str(tmp_path / "mean.tif")] * (command == "stack")
+    assert main([command, str(picture), "--pixel-size", "5nm", *output]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("semcal: ")
+    assert "picture.tif" in line
