@@ -14,6 +14,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,26 @@ def test_a_second_update_continues_from_the_first(calibrated: CalibrationResult)
     assert len(second.model.statistics["updates"]) == 2
     # What was added to the first is not changed by the second.
     assert len(first.model.statistics["updates"]) == 1
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.3])
+def test_residuals_that_nothing_explains_are_warned_of_until_the_next_update(
+    calibrated: CalibrationResult, noise_px: float
+) -> None:
+    rng = np.random.default_rng(5)
+    views = [
+        replace(v, image_xy=v.image_xy + rng.normal(0.0, noise_px, v.image_xy.shape))
+        for v in simulated(SEM.camera_at, CHECKED, 66)
+    ]
+    done = update_calibration(calibrated.model, views, image_size=SEM.image_size, axis=AXIS)
+    old = list(calibrated.model.statistics["warnings"])
+    warnings = list(done.model.statistics["warnings"])
+    assert warnings[: len(old)] == old
+    new = [text for text in warnings if text.startswith("scale: residuals of the update are")]
+    assert len(new) == (noise_px > 0.0)
+    views = simulated(SEM.camera_at, CHECKED, 67)
+    after = update_calibration(done.model, views, image_size=SEM.image_size, axis=AXIS)
+    assert list(after.model.statistics["warnings"]) == old
 
 
 def test_contradictions_and_impossible_ageing_are_refused(calibrated: CalibrationResult) -> None:

@@ -54,6 +54,11 @@ MISFIT_SIGMA = TABLE.measured(
     "from 100x to 5000x, on 26 November 2026.",
     command="python -m benchmarks.calibration --quick",
 )
+UPDATE_MISFIT = TABLE.derived(
+    "UPDATE_MISFIT", 2.0, "of the sigma",
+    "That the residuals of an update may be without a warning: ten MISFIT_SIGMA above one. Lines that jitter by a "
+    "twentieth of a pixel leave up to 1.5.",
+)
 OTHER_SCALE = TABLE.measured(
     "OTHER_SCALE", 0.1, "of the scale",
     "Change of the scale beyond which this is another microscope, display width or grid: an SEM repeats to below 1 %, "

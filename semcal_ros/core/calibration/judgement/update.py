@@ -42,12 +42,19 @@ from semcal_ros.core.calibration.judgement.revision import (
     make_setup,
     revise,
 )
-from semcal_ros.core.calibration.judgement.thresholds import AGEING_MAX, DEFAULT_AGEING, SHAPE_PART
+from semcal_ros.core.calibration.judgement.thresholds import (
+    AGEING_MAX,
+    DEFAULT_AGEING,
+    SHAPE_PART,
+    UPDATE_MISFIT,
+)
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel, columns_of, with_coefficients
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
+
+_UPDATE_WARNING = "scale: residuals of the update are"
 
 
 @dataclass(frozen=True)
@@ -138,12 +145,26 @@ def update_calibration(
         "scale_sigma": check.scale_sigma,
     }
     statistics = {**model.statistics, "updates": [*(log if isinstance(log, list) else []), entry]}
+    statistics |= {"warnings": _warnings_after(model.statistics.get("warnings"), check.misfit)}
     record = model.record
     if record is not None:
         # What the covariance consists of is no longer what the calibration says.
         record = replace(record, scale_shares=None)
     renewed = replace(renewed, statistics=statistics, record=record)
     return CalibrationUpdate(renewed, check, ageing, rms_px)
+
+
+def _warnings_after(before: object, misfit: float) -> list[str]:
+    """The warnings of a calibration after an update, of which the last one alone is spoken."""
+    kept = [text for text in before if isinstance(text, str)] if isinstance(before, list) else []
+    kept = [text for text in kept if not text.startswith(_UPDATE_WARNING)]
+    if misfit > UPDATE_MISFIT:
+        kept.append(
+            f"{_UPDATE_WARNING} {misfit:.1f} times what the uncertainty of the corners explains: the pictures are "
+            "noisy or blurred, or the camera has changed in a way that few views do not tell; what was renewed is less "
+            "certain than stated"
+        )
+    return kept
 
 
 def ageing_sigmas(ageing: float, image_width: int) -> dict[str, float]:
