@@ -90,15 +90,16 @@ def clone_measured(
     measure: Measure,
     noise: Array,
     *,
-    changes: int = 0,
+    is_changed: bool = False,
 ) -> TrackerState:
     """Make this frame a keyframe, as it was measured against the one before; ``noise`` (2, 2) is the covariance of its
-    position as a keyframe about the measured one, and ``changes`` how often the specimen had changed.
+    position as a keyframe about the measured one, and ``is_changed`` whether the specimen has changed since.
     """
     drift, turn = state.filter.state, match.similarity.removed
     keyframe = make_keyframe(
         frame, match.removed, match.image, match.region, drift.time_s, turn, match.fixed
     )
+    changes = state.keyframes[measure.key].changes + int(is_changed)
     store = state.keyframes.add(replace(keyframe, changes=changes))
     key, similarity = store.latest, state.similarity
     if match.candidate.rescaled:
@@ -168,8 +169,9 @@ def renew_keyframe(
             if candidate.rescaled:
                 before = state.keyframes[candidate.key].frame
                 measure = add_zoom_uncertainty(measure, before, frame)
-            changes = noted.changes + int(is_changed)
-            state = clone_measured(setup, state, frame, match, measure, noise, changes=changes)
+            state = clone_measured(
+                setup, state, frame, match, measure, noise, is_changed=is_changed
+            )
             status = DriftStatus.KEYFRAME
     elif (
         setup.settings.average
