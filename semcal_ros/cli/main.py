@@ -20,7 +20,6 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable
 from copy import copy
 from functools import wraps
 from importlib import import_module
@@ -29,7 +28,7 @@ from typing import Any
 import click
 
 import semcal_ros
-from semcal_ros.cli.options import find_lost_input
+from semcal_ros.cli.options import spare_inputs
 from semcal_ros.core.errors import SemcalError, UnusableCalibrationError
 from semcal_ros.core.wording import did_you_mean
 from semcal_ros.middleware import add_environment_prefix
@@ -77,10 +76,7 @@ class _Group(click.Group):
                 expected="the packages of requirements/base.txt, in versions that fit each other",
                 do="run `make setup`, or reinstall them",
             ) from error
-        command: click.Command = copy(module.command)
-        if command.callback is not None:
-            command.callback = _guarded(command.callback)
-        return command
+        return _guard(module.command)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -98,20 +94,18 @@ class _Group(click.Group):
             formatter.write_dl(sorted(_COMMANDS.items()))
 
 
-def _guarded(callback: Callable[..., Any]) -> Callable[..., Any]:
-    """What a command does, unless it would write over a file that it reads; until nobody reads its output any more."""
+def _guard(command: click.Command) -> click.Command:
+    """The command, or all of a group, that writes over no file that it reads, and ends when nobody reads its output."""
+    guarded = copy(command)
+    if isinstance(guarded, click.Group):
+        guarded.commands = {name: _guard(one) for name, one in guarded.commands.items()}
+        return guarded
+    callback = command.callback
+    assert callback is not None
 
     @wraps(callback)
     def call(*given: Any, **named: Any) -> Any:
-        context = click.get_current_context()
-        found = find_lost_input(context)
-        if found is not None:
-            output, source = found
-            raise SemcalError(
-                f"{output} is also an input of this command ({source})",
-                expected="an output of its own",
-                do="choose another name",
-            )
+        spare_inputs(click.get_current_context())
         try:
             return callback(*given, **named)
         except BrokenPipeError:
@@ -120,7 +114,8 @@ def _guarded(callback: Callable[..., Any]) -> Callable[..., Any]:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
 
-    return call
+    guarded.callback = call
+    return guarded
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})

@@ -184,10 +184,14 @@ _WRITTEN = frozenset(
 _REPLACED = frozenset({("update", "calibration"), ("extend", "calibration")})
 
 
-def find_lost_input(context: click.Context) -> tuple[str, str] | None:
-    """Find an output of a command that is one of the files it reads, by whatever name: the option, and the input.
+def spare_inputs(context: click.Context) -> None:
+    """Refuse an output of a command that is one of the files it reads, by whatever name; the calibration that
+    ``update`` and ``extend`` renew may be replaced.
 
-    The calibration that ``update`` and ``extend`` renew may be replaced.
+    Raises
+    ------
+    InvalidValueError
+        An output is an input.
     """
     written, read = [], []
     for parameter in context.command.params:
@@ -202,8 +206,11 @@ def find_lost_input(context: click.Context) -> tuple[str, str] | None:
     for option, path in written:
         for name, source in read:
             if os.path.samefile(path, source):
-                return f"{option} {path}", name
-    return None
+                raise InvalidValueError(
+                    f"{option} {path} is also an input of this command ({name})",
+                    expected="an output of its own",
+                    do="choose another name",
+                )
 
 
 class FiniteRange(click.FloatRange):

@@ -24,10 +24,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import click
+import cv2
+import numpy as np
 import pytest
 
 from semcal_ros.cli import main
-from semcal_ros.cli.output import echo_rejected, show_progress
+from semcal_ros.cli.output import echo_rejected
 from semcal_ros.core.calibration.views import RejectedView, ViewStatus
 from semcal_ros.core.errors import Rejection
 from tests.helpers.node_scenes import make_calibration
@@ -158,10 +160,25 @@ def test_a_reader_who_has_seen_enough_is_no_failure(
     assert main(["info", str(calibration)]) == 0
 
 
-def test_a_closed_stderr_keeps_no_command_from_its_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_stderr_keeps_no_command_from_its_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "picture.png"
+    cv2.imwrite(str(picture), np.arange(64 * 64, dtype=np.uint16).reshape(64, 64))
     monkeypatch.setattr(sys, "stderr", None)
-    with show_progress() as on_progress:
-        on_progress("reading", 1, 2)
+    assert main(["info", str(picture), "--pixel-size", "5nm"]) == 0
+    assert "64 x 64" in capsys.readouterr().out
+
+
+def test_a_command_of_a_group_writes_over_nothing_that_it_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = tmp_path / "cal.yaml"
+    make_calibration().save(calibration)
+    given = ["measure", "cantilever", str(tmp_path), "--calibration", str(calibration)]
+    given += ["--length", "5um", "-o", str(calibration)]
+    assert main(given) == 2
+    assert "is also an input of this command" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["drift", "check", "rectify"])

@@ -205,12 +205,12 @@ def find_image_files(path: Path) -> list[Path]:
     if path.is_dir():
         listed = [p for p in path.iterdir() if p.is_file() and is_image_file(p)]
         what = f"{path} has no image file"
+    elif path.is_file():
+        listed = [path] if is_image_file(path) else []
+        what = f"{path} does not have the name of an image or a video"
     elif path.exists():
         # A pipe would be waited for.
-        listed = [path] if path.is_file() and is_image_file(path) else []
-        what = f"{path} does not have the name of an image or a video"
-        if not path.is_file():
-            what = f"{path} is no regular file"
+        listed, what = [], f"{path} is no regular file"
     elif glob.has_magic(str(path)):
         found = (Path(name) for name in glob.glob(str(path), recursive=True))
         listed = [p for p in found if p.is_file() and is_image_file(p)]
