@@ -596,8 +596,9 @@ class Viewer(SemNode):
     def _on_velocity(self, message: Any, _info: Any) -> None:
         linear, covariance = message.twist.twist.linear, message.twist.covariance
         variance = max(covariance[0], covariance[7], 0.0)
-        known = variance < UNKNOWN_VARIANCE and math.isfinite(math.hypot(linear.x, linear.y))
-        self._speed = (math.hypot(linear.x, linear.y), math.sqrt(variance)) if known else None
+        speed = math.hypot(linear.x, linear.y)
+        known = variance < UNKNOWN_VARIANCE and math.isfinite(speed)
+        self._speed = (speed, math.sqrt(variance)) if known else None
 
     def _on_diagnostics(self, message: Any, _info: Any) -> None:
         own = self.get_namespace().rstrip("/") + "/"

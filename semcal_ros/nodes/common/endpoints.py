@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import struct
 import time
-import traceback
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -42,7 +41,7 @@ from semcal_ros.nodes.common.qos import (
     service_queue,
     stream_output,
 )
-from semcal_ros.nodes.common.reporter import NODE_ERRORS
+from semcal_ros.nodes.common.reporter import NODE_ERRORS, describe_fault
 from semcal_ros.nodes.common.subscription import AdaptiveSubscription, MessageInfo
 
 # Fast DDS waits 100 ms by itself before it refuses, so these are a second. A stream does not want to wait for longer.
@@ -164,7 +163,8 @@ def read_stamp_ns(data: bytes) -> int:
         If there are too few bytes for one.
     """
     try:
-        # Four bytes of encapsulation, the second of which says the byte order.
+        # Four bytes of encapsulation, the second of which says the byte order; then the stamp, with which
+        # std_msgs/Header and so every image begins.
         order = "<" if data[1] & 1 else ">"
         seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
     except (IndexError, struct.error) as error:
@@ -360,15 +360,9 @@ class Endpoints:
             except NODE_ERRORS as error:
                 response.message = " ".join(str(error).split())
                 response.success = False
-            except (
-                Exception
-            ) as error:  # Who asks gets an answer, and what the node holds is not lost.
-                if not rclpy.utilities.ok():
-                    raise
-                self._node.get_logger().error(traceback.format_exc())
-                response.message = (
-                    f"a fault of this software, please report it: {type(error).__name__}: {error}"
-                )
+            except Exception as error:
+                # Who asks gets an answer, and what the node holds is not lost.
+                response.message = describe_fault(error)
                 response.success = False
             if on_answer is not None:
                 on_answer(response.success, response.message)

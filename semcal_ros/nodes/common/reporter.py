@@ -93,23 +93,10 @@ class Reporter:
         self.warn_seldom(reason)
 
     def blame_itself(self, error: Exception) -> None:
-        """Count a message on which the node itself failed, and log where, though not again and again.
-
-        Raises
-        ------
-        Exception
-            The error itself where ROS is being shut down, which is no fault.
+        """Count a message on which the node itself failed, and log where, though not again and again; raises as
+        :func:`describe_fault`.
         """
-        if not rclpy.utilities.ok():
-            raise error
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        file = "/".join(Path(place.filename).parts[-3:])
-        self.reject(
-            RuntimeError(
-                f"a fault of this software, please report it: {type(error).__name__}: {error} "
-                f"({file}, line {place.lineno})"
-            )
-        )
+        self.reject(RuntimeError(describe_fault(error)))
 
     def count_received(self) -> None:
         """Count a frame that has come in."""
@@ -123,6 +110,21 @@ class Reporter:
             if abs(latency_s) > _OTHER_CLOCK_S:
                 latency_s = None
         self.statistics.publish(time.monotonic(), latency_s)
+
+
+def describe_fault(error: Exception) -> str:
+    """Say that the software itself has failed, and where.
+
+    Raises
+    ------
+    Exception
+        The error itself where ROS is being shut down, which is no fault.
+    """
+    if not rclpy.utilities.ok():
+        raise error
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    file = "/".join(Path(place.filename).parts[-3:])
+    return f"a fault of this software, please report it: {type(error).__name__}: {error} ({file}, line {place.lineno})"
 
 
 def _printable(text: str) -> str:

@@ -138,9 +138,6 @@ def is_late(waited_s: float, interval_s: float) -> bool:
 
 # Number of frames: seconds of any stream, longer than another node holds a frame.
 _KEPT = 256
-# Bytes of the encapsulation; after it comes the stamp, with which std_msgs/Header and so every image begins.
-_ENCAPSULATION = 4
-_NS_PER_S = 1_000_000_000  # nanoseconds per second
 
 
 class SourceTimestamps:
