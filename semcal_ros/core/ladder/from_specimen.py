@@ -62,6 +62,7 @@ from semcal_ros.core.ladder.thresholds import (
     STEP_MAX,
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup
+from semcal_ros.core.wording import format_length
 
 #: The method of the calibration, as its file says it.
 METHOD = "specimen"
@@ -377,7 +378,7 @@ def _check_display_width(anchor: ScaleAnchor, width_px: int) -> None:
     low, high = DISPLAY_WIDTH_LIMITS_M
     if not low <= width_m <= high:
         raise InvalidValueError(
-            f"a pixel size of {1e9 * anchor.pixel_size_m:.3g} nm at {anchor.magnification:g}x, that is, a display of "
+            f"a pixel size of {format_length(anchor.pixel_size_m)} at {anchor.magnification:g}x, that is, a display of "
             f"{width_m:.3g} m",
             expected=f"one of {low:g} to {high:g} m",
             do="check the unit of the known size, and the magnification",

@@ -58,7 +58,7 @@ from semcal_ros.core.camera.calibration_model import (
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.uncertainty import worst_pixel_size
 from semcal_ros.core.errors import InvalidValueError, SemcalError
-from semcal_ros.core.wording import rounded_magnification
+from semcal_ros.core.wording import format_length, rounded_magnification
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def plan_views(
     ]
     if all(i is None for i in information):
         raise InvalidValueError(
-            f"squares of {', '.join(f'{1e6 * s:.3g} um' for s in squares_m)}, of which no magnification shows corners",
+            f"squares of {', '.join(format_length(s) for s in squares_m)}, of which no magnification shows corners",
             expected="squares of which several fit into the field of view",
             do="name the squares that the grid has",
         )
