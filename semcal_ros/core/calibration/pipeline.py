@@ -92,6 +92,8 @@ from semcal_ros.core.calibration.thresholds import (
     SUSPECTS_MAX,
     UNTILTED_CONFIDENCE,
     VIEWS_MIN,
+    WINDOW_BIAS_ROUNDS,
+    WINDOW_BIAS_SETTLED,
     WORTHWHILE_PART,
 )
 from semcal_ros.core.calibration.views import (
@@ -100,6 +102,8 @@ from semcal_ros.core.calibration.views import (
     ViewStatus,
     refuse_tilted_lines,
 )
+from semcal_ros.core.calibration.window_bias import approach_window_bias, undo_window_bias
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 from semcal_ros.core.corners.thresholds import MINIMUM_CORNERS
 from semcal_ros.core.errors import (
     CalibrationError,
@@ -166,7 +170,7 @@ def calibrate_views(
     is_optional = any(view.has_stage_tilt for view in views) and are_enough(bare, options)
     failed: CalibrationError | None = None
     try:
-        joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
+        joint, setup, outliers, notes = _fit_all(setup, options, on_stage)
         contradiction = _find_contradicted_stage(views, setup)
         if not contradiction:
             notes += [*_find_turned_axis(views, setup, joint), *lines]
@@ -186,7 +190,7 @@ def calibrate_views(
         )
     try:
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
-        joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
+        joint, setup, outliers, notes = _fit_all(setup, options, on_stage)
         notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
         return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
     except CalibrationError as error:
@@ -394,6 +398,40 @@ def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> t
             expected=f"magnifications above {low:g} and up to {high:g}",
         )
     return breaks
+
+
+def _fit_all(
+    setup: Setup, options: CalibrationOptions, on_stage: Callable[[str, float], None]
+) -> tuple[JointFit, Setup, tuple[RejectedView, ...], list[Finding]]:
+    """Fit without the views that disagree, as :func:`_fit_without_outliers`, and without the bias of corners.
+
+    Where the beam settles within their windows, corners are found off, which only a fit tells: that is taken out, and
+    they are fitted again, until they hardly move.
+    """
+    joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
+    found = setup.views
+    removed = [np.zeros_like(view.image_xy) for view in found]
+    for _ in range(WINDOW_BIAS_ROUNDS):
+        functions = joint.adjustment.functions
+        amplitudes = {
+            g: np.array([functions[name](g) if name in functions else 0.0 for name in SCAN_NAMES])
+            for g in setup.magnifications.tolist()
+        }
+        nearer = [
+            approach_window_bias(view, before, amplitudes[view.magnification], setup.raster)
+            for view, before in zip(found, removed, strict=True)
+        ]
+        moves = [
+            np.max(np.linalg.norm(now - before, axis=1) / view.sigma_px)
+            for view, before, now in zip(found, removed, nearer, strict=True)
+        ]
+        if max(moves, default=0.0) < WINDOW_BIAS_SETTLED:
+            break
+        removed = nearer
+        views = tuple(undo_window_bias(v, b) for v, b in zip(found, removed, strict=True))
+        setup = replace(setup, views=views)
+        joint = fit_joint(setup, options.residual, on_stage)
+    return joint, setup, outliers, notes
 
 
 def _fit_without_outliers(

@@ -355,3 +355,15 @@ START_RHO_MAX = TABLE.derived(
     "START_RHO_MAX", 1.0 / 5e-3, "1/m",
     "The depth gradient of weakly tilted views is noisy, and a pivot nearer than 5 mm would be noise.",
 )
+WINDOW_BIAS_PART = TABLE.stated(
+    "WINDOW_BIAS_PART", 0.5, "ratio",
+    "Sigma of the bias of a window that is taken out, over this bias.",
+)
+WINDOW_BIAS_SETTLED = TABLE.derived(
+    "WINDOW_BIAS_SETTLED", 0.3, "sigmas",
+    "By which corners move at most from one fit to the next: 0.1 more of the chi-square of a corner, which is 2.",
+)
+WINDOW_BIAS_ROUNDS = TABLE.cost(
+    "WINDOW_BIAS_ROUNDS", 4, "fits",
+    "Until the corners no longer move; the largest moves by 12, 9, 0.9 and 0.07 sigmas where the beam settles by 3 px.",
+)

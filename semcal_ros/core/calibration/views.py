@@ -72,6 +72,8 @@ class GridView:
     across
         (n, 2) unit vectors across the lines of a grating, the only direction in which its points are known; None
         where both are.
+    scan_response
+        (n, 2, 2) as of :class:`~semcal_ros.core.corners.LatticeDetection`, or None where it is not known.
     """
 
     magnification: float
@@ -86,6 +88,7 @@ class GridView:
     untilted: bool = False
     excess_px: float = 0.0
     across: Array | None = None
+    scan_response: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.board_xy_m)
@@ -146,6 +149,7 @@ class GridView:
             sigma_px=self.sigma_px[keep],
             covariance_px2=spread,
             across=None if self.across is None else self.across[keep],
+            scan_response=None if self.scan_response is None else self.scan_response[keep],
         )
 
     @property
@@ -373,6 +377,7 @@ def views_from_detections(
             stage,
             untilted=bool(len(d.across)),
             across=d.across if len(d.across) else None,
+            scan_response=d.scan_response if len(d.scan_response) else None,
         )
         for d, g, square, label, stage, visit in zip(
             detections,

@@ -240,7 +240,8 @@ class ScanCamera:
         return tuple(getattr(self, name) for name in LENS_NAMES)
 
     @property
-    def _scan_amplitudes(self) -> Array:
+    def scan_amplitudes(self) -> Array:
+        """(k,) amplitudes of the distortion of the scan, in the order of :data:`SCAN_NAMES`."""
         return np.array([getattr(self, name) for name in SCAN_NAMES])
 
     # -- projection -------------------------------------------------------------------------------
@@ -351,7 +352,7 @@ class ScanCamera:
     @property
     def distorts_scan(self) -> bool:
         """Whether coils or settling distort the scan."""
-        return bool(np.any(self._scan_amplitudes))
+        return bool(np.any(self.scan_amplitudes))
 
     def without_residual(self, xy: ArrayLike) -> Array:
         """Return where raw pixels (n, 2) would lie under the parametric distortion alone."""
@@ -363,21 +364,21 @@ class ScanCamera:
     @property
     def scan_key(self) -> tuple[object, ...]:
         """What the distortion of the scan depends on, for looking it up."""
-        return (self.raster, *self._scan_amplitudes.tolist())
+        return (self.raster, *self.scan_amplitudes.tolist())
 
     def deflect(self, xy: ArrayLike) -> Array:
         """Return where the beam should be, px, at raw pixels (n, 2): without residual field and distortion of the scan.
 
         What is left is the distortion of the lens.
         """
-        straight, amplitudes = self.without_residual(xy), self._scan_amplitudes
+        straight, amplitudes = self.without_residual(xy), self.scan_amplitudes
         if not np.any(amplitudes):
             return straight
         return straight + deflection_shift(straight, amplitudes, self.raster)
 
     def _stretch(self, xy: Array) -> Array:
         """(n, 2) derivative of the deflection along each axis by the raw pixel (n, 2) without the residual field."""
-        return deflection_stretch(self.without_residual(xy), self._scan_amplitudes, self.raster)
+        return deflection_stretch(self.without_residual(xy), self.scan_amplitudes, self.raster)
 
     def _with_residual(self, xy: Array) -> Array:
         """Invert :meth:`without_residual`."""
@@ -388,7 +389,7 @@ class ScanCamera:
 
     def distort(self, xy: ArrayLike) -> Array:
         """Distort undistorted pixels (n, 2) to raw pixels (n, 2); NaN where ``4 xi_r r2 >= 1``."""
-        seen, amplitudes = self._distort_by_lens(xy), self._scan_amplitudes
+        seen, amplitudes = self._distort_by_lens(xy), self.scan_amplitudes
         if np.any(amplitudes):
             seen = raw_from_deflection(seen, amplitudes, self.raster)
         return self._with_residual(seen)

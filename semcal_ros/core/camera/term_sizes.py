@@ -68,7 +68,7 @@ def displace_by(camera: ScanCamera, kind: str, xy: Array) -> Array:
     if kind == "residual field":
         return camera.without_residual(xy) - xy
     if kind in ("coils", "settling"):
-        amplitudes = np.array([getattr(camera, name) for name in SCAN_NAMES])
+        amplitudes = camera.scan_amplitudes
         chosen = np.zeros(len(SCAN_NAMES), dtype=bool)
         chosen[SETTLING] = True
         if kind == "coils":

@@ -261,6 +261,9 @@ class PositionFit:
     covariance
         (n, 2, 2) covariance of the positions, px^2, for the noise model given (unit noise without
         one).
+    scan_response
+        (n, 2, 2) by how far a position moves, px, where the displacement of the picture along x has another slope
+        (``[:, 0]``) and another second derivative, per px (``[:, 1]``), in the window than the local map.
     chi2
         (n,) weighted squared residuals per degree of freedom.
     freedom
@@ -276,6 +279,7 @@ class PositionFit:
 
     xy: Array
     covariance: Array
+    scan_response: Array
     chi2: Array
     freedom: Array
     level: Array
@@ -436,7 +440,9 @@ def _fit_block(
         pull = known * (prior.mean - np.column_stack([nonlinear, linear]))
         right += pull
         # Covariances are those of the last step.
-        sides = [right[:, :, None]] if left else [right[:, :, None], axes]
+        sides = [right[:, :, None]]
+        if not left:
+            sides += [axes, displaced_sides(windows, nonlinear[:, 0], jacobian, weight)]
         solution = np.linalg.solve(normal, np.concatenate(sides, axis=2)).astype(
             np.float64, copy=False
         )
@@ -460,6 +466,7 @@ def _fit_block(
     return CornerFit(
         windows.origin + nonlinear[:, :2],
         solution[:, :2, 1:3],
+        np.swapaxes(solution[:, :2, 4:6], 1, 2),
         chi2,
         freedom,
         level,
@@ -534,6 +541,24 @@ def normal_equations(jacobian: Array32, residual: Array32, weight: Array32) -> t
     diagonal *= 1.0 + 1e-6
     diagonal += 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12
     return normal, right
+
+
+def displaced_sides(windows: PixelWindows, x: Array, jacobian: Array32, weight: Array32) -> Array:
+    """Return (n, a, 2) right-hand sides that displacements along x by u and by u^2 / 2 make, u px from a point.
+
+    Parameters
+    ----------
+    windows
+        Pixels of n points.
+    x
+        (n,) positions of the points relative to the windows, px.
+    jacobian, weight
+        (n, a, p) derivatives, that by x first, and (n, p) weights.
+    """
+    away = windows.x - x.astype(np.float32)[:, None]
+    moved = np.stack([away, np.float32(0.5) * away * away], axis=1)
+    moved *= (jacobian[:, 0] * weight)[:, None]
+    return np.asarray(jacobian @ moved.transpose(0, 2, 1), dtype=np.float64)
 
 
 def _solve_linear(

@@ -135,6 +135,9 @@ class LatticeDetection:
     across
         (n, 2) unit vectors across the lines of a grating, along which alone the positions are known, and to which
         ``sigma_px`` refers; (0, 2) for other patterns.
+    scan_response
+        (n, 2, 2) by how far each position moves, px, where the displacement of the picture along x has another slope
+        (``[:, 0]``) and another second derivative, per px (``[:, 1]``), about it than the lattice has.
     """
 
     ij: Indices
@@ -148,6 +151,7 @@ class LatticeDetection:
     pattern: Pattern = "chess"
     odds: float = float("nan")
     across: Array = field(default_factory=_no_positions)
+    scan_response: Array = field(default_factory=_no_covariance)
 
     @property
     def rejected(self) -> int:
@@ -528,6 +532,7 @@ def _refine(
         xy=enlarged(points.xy, factor),
         rejected_xy=enlarged(points.rejected_xy, factor),
         covariance=factor**2 * points.covariance,
+        scan_response=points.scan_response * np.array([factor, factor**2])[:, None],
         blur_px=factor * points.blur_px,
     )
 
@@ -617,4 +622,5 @@ def _make_detection(
         corners.rejected_xy,
         pattern,
         odds,
+        scan_response=corners.scan_response,
     )

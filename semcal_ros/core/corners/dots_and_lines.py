@@ -273,6 +273,7 @@ def refine_cells(image: Array32, cells: Lattice, shape: CellShape) -> RefinedCor
         last.cells[keep][order],
         last.fit.xy[keep][order],
         covariance[keep][order],
+        last.fit.scan_response[keep][order],
         shape.blur * spacing,
         quality,
         failed,

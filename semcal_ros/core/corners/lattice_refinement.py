@@ -67,6 +67,8 @@ class RefinedCorners:
         (n, 2) indices and positions.
     covariance
         (n, 2, 2), px^2.
+    scan_response
+        (n, 2, 2) as of :class:`~semcal_ros.core.corners.corner_fit.PositionFit`.
     blur_px
         Median blur.
     quality
@@ -80,6 +82,7 @@ class RefinedCorners:
     ij: Indices
     xy: Array
     covariance: Array
+    scan_response: Array
     blur_px: float
     quality: float
     rejected_xy: Array
@@ -208,6 +211,7 @@ def _result(
         fitted.cells[keep][order],
         fit.xy[keep][order],
         covariance[order],
+        fit.scan_response[keep][order],
         float(np.median(fit.blur_px[keep])),
         quality,
         rejected_xy,

@@ -35,6 +35,7 @@ from semcal_ros.core.arrays import Array, Array32
 from semcal_ros.core.corners.corner_fit import (
     NoiseModel,
     PositionFit,
+    displaced_sides,
     normal_equations,
     split_statistics,
 )
@@ -357,6 +358,7 @@ def _fit_block(
             normal[:, axis, axis] += 1.0 / spacing[:, 0] ** 2
             right[:, axis] -= moved[:, axis] / spacing[:, 0] ** 2
         covariance = np.linalg.inv(normal).astype(np.float64, copy=False)
+        sides = displaced_sides(windows, moved[:, 0], jacobian, weight)
         step = (covariance @ right[:, :, None])[:, :, 0]
         moved = moved + np.clip(step[:, :2], -limit, limit)
         levels = levels + step[:, 2:]
@@ -372,6 +374,7 @@ def _fit_block(
     return CellFit(
         maps.xy + moved,
         covariance[:, :2, :2],
+        np.swapaxes(covariance[:, :2] @ sides, 1, 2),
         chi2,
         freedom,
         level,

@@ -34,6 +34,7 @@ from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.calibration.judgement.thresholds import FREE_CHANGE, POSE_STEPS_MAX
 from semcal_ros.core.calibration.stage import StageAxis, attitudes
 from semcal_ros.core.calibration.views import GridView, add_excess_noise, estimate_excess_sigma_px
+from semcal_ros.core.calibration.window_bias import flatten_view
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
@@ -86,16 +87,13 @@ class ScaleError:
 def _without_fields(
     views: Sequence[GridView], camera_at: Callable[[float], ScanCamera]
 ) -> tuple[Array, list[ScanCamera], list[GridView]]:
-    """Return the magnifications, their cameras, and the views without the residual field."""
+    """Return the magnifications, their cameras, and the views without the residual field and the bias of windows."""
     if not views:
         raise CalibrationError("no views", expected="at least one view of a grid")
     magnifications = np.unique([v.magnification for v in views])
     cameras = [camera_at(float(g)) for g in magnifications]
     group = np.searchsorted(magnifications, [v.magnification for v in views])
-    corrected = [
-        replace(v, image_xy=cameras[k].without_residual(v.image_xy))
-        for v, k in zip(views, group, strict=True)
-    ]
+    corrected = [flatten_view(v, cameras[k]) for v, k in zip(views, group, strict=True)]
     return magnifications, cameras, corrected
 
 

@@ -56,6 +56,7 @@ from semcal_ros.core.calibration.views import (
     estimate_excess_sigma_px,
     refuse_tilted_lines,
 )
+from semcal_ros.core.calibration.window_bias import flatten_view
 from semcal_ros.core.camera.calibration_model import (
     ALL_FUNCTIONS,
     CalibrationModel,
@@ -154,9 +155,7 @@ def make_setup(
         )
     ordered = sorted(inside, key=lambda v: v.magnification)
     cameras = {v.magnification: model.at(v.magnification).resized(*image_size) for v in ordered}
-    flat = tuple(
-        replace(v, image_xy=cameras[v.magnification].without_residual(v.image_xy)) for v in ordered
-    )
+    flat = tuple(flatten_view(v, cameras[v.magnification]) for v in ordered)
     priors = Priors()
     if model.record is not None and model.record.is_wide:
         priors = priors.of_photographs(cameras[flat[0].magnification].rho)
