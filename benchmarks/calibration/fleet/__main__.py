@@ -18,6 +18,7 @@
     python -m benchmarks.calibration.fleet --seed 0 --only 17
     python -m benchmarks.calibration.fleet --misstate [...]
     python -m benchmarks.calibration.fleet --other-physics [...]
+    python -m benchmarks.calibration.fleet --pictures --count 40 [...]
 
 A microscope is *raised* if its calibration raises anything, *warned* if it prints a warning of numpy, and *wrong* if
 at a magnification between the calibrated ones the error after a pose fit is beyond both 0.1 px and 4 stated sigmas, or
@@ -27,7 +28,8 @@ is wrong, and the RMS of the error over sigma of the fleet is 0.7 to 1.4, in pix
 `--only` repeats the one of this index, with all details. It is the same one whatever the count. With `--misstate` one
 view of each states a wrong magnification. The limit is the same, and no view may be left out but that one. That it is
 left out is no limit: what a height or a repeatability of the scale explains does no harm. With `--other-physics` the
-same microscopes have lenses and amplifiers of other forms than the calibration's.
+same microscopes have lenses and amplifiers of other forms than the calibration's. With `--pictures` their corners are
+found in pictures, which are smaller and fewer; it takes a minute for each.
 """
 
 from __future__ import annotations
@@ -191,9 +193,9 @@ def line_of(own: Outcome) -> str:
     return text
 
 
-def show_one(seed: int, index: int, *, misstate: bool, other_physics: bool) -> None:
-    """Print everything about one microscope."""
-    own, trace = judge(seed, index, misstate=misstate, other_physics=other_physics)
+def show_one(seed: int, index: int, **kind: bool) -> None:
+    """Print everything about one microscope; ``kind`` as for :func:`judge`."""
+    own, trace = judge(seed, index, **kind)
     for name, value in own.microscope.items():
         print(f"{name:18s} {value}")
     print(line_of(own))
@@ -224,20 +226,17 @@ def main() -> int:
     parser.add_argument("--only", type=int, metavar="INDEX", help="one microscope, in detail")
     parser.add_argument("--misstate", action="store_true", help="one wrong magnification in each")
     parser.add_argument("--other-physics", action="store_true", help="lenses of other forms")
+    parser.add_argument("--pictures", action="store_true", help="corners are found in pictures")
     parser.add_argument("--jobs", type=int, default=1, help="processes; default 1")
     parser.add_argument("--json", type=Path, metavar="FILE", help="results of each microscope")
     given = parser.parse_args()
+    kind = {name: getattr(given, name) for name in ("misstate", "other_physics", "pictures")}
     if given.only is not None:
-        show_one(given.seed, given.only, misstate=given.misstate, other_physics=given.other_physics)
+        show_one(given.seed, given.only, **kind)
         return 0
     outcomes = []
     jobs = Parallel(n_jobs=given.jobs, return_as="generator")
-    tasks = (
-        delayed(judge)(
-            given.seed, index, misstate=given.misstate, other_physics=given.other_physics
-        )
-        for index in range(given.count)
-    )
+    tasks = (delayed(judge)(given.seed, index, **kind) for index in range(given.count))
     for own, _ in jobs(tasks):
         outcomes.append(own)
         print(line_of(own), flush=True)

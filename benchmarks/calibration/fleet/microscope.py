@@ -31,6 +31,7 @@ amplifiers of the coils saturate (a tanh curve, as large).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -163,8 +164,8 @@ class Microscope:
         lens = lens + c * r2 * np.stack([-q[:, 1], q[:, 0]], axis=1)
         out = np.array(self.centre_px) + norm * lens
         z = 2.0 * (out - self.middle) / self.size
-        out = out + np.array(self.coil_px) * (self._odd(z) + 0.4 * z * z)
-        out[:, 0] = self._settle(out[:, 0])
+        out = out + np.array(self.coil_px) * (self.add_to_ramp(z) + 0.4 * z * z)
+        out[:, 0] = self.settle(out[:, 0])
         return out
 
     def _radial(self, k: float, r2: Array) -> Array:
@@ -175,7 +176,7 @@ class Microscope:
         angle = np.sqrt(3.0 * abs(k) * r2) + 1e-9
         return np.asarray((np.tan(angle) if k > 0.0 else np.arctan(angle)) / angle)
 
-    def _odd(self, z: Array) -> Array:
+    def add_to_ramp(self, z: Array) -> Array:
         """What an amplifier adds to a ramp, 0 at both ends and 0.385 at most in between."""
         if self.saturation == 0.0:
             return z**3 - z
@@ -185,7 +186,8 @@ class Microscope:
         bent = np.tanh(self.saturation * z) / np.tanh(self.saturation) - z
         return np.asarray(-2.0 / 27.0**0.5 * bent / top)
 
-    def _settle(self, x: Array) -> Array:
+    def settle(self, x: Array) -> Array:
+        """Columns of the picture where the beam should be at these ones."""
         if self.settling_px == 0.0:
             return x
         # Left of the picture there is no time in which it could grow.
@@ -342,11 +344,20 @@ def _draw_tilts(own: Microscope, rng: np.random.Generator) -> tuple[Array, Array
     return tilts + TILT_ERROR_RAD * rng.normal(size=own.views), axes
 
 
-def record(own: Microscope) -> list[SeenGrid]:
-    """The corners of a recording: upwards through all magnifications, on a second visit down again."""
-    rng = np.random.default_rng((own.seed, own.index, 1))
+@dataclass(frozen=True)
+class Shot:
+    """How a picture is taken: the turn and the height (m) of the grid, and the factor on the scale of this visit."""
+
+    magnification: float
+    rotation: Array
+    height_m: float
+    factor: float
+    visit: int
+
+
+def take_shots(own: Microscope, rng: np.random.Generator) -> Iterator[Shot]:
+    """The pictures of a recording: upwards through all magnifications, on a second visit down again."""
     order = [g for k in range(own.visits) for g in own.magnifications[:: 1 if k == 0 else -1]]
-    out: list[SeenGrid] = []
     visit = -1
     for stop, g in enumerate(order):
         # At the turning point the magnification is not set anew.
@@ -357,31 +368,27 @@ def record(own: Microscope) -> list[SeenGrid]:
         for tilt, axis in zip(tilts, axes, strict=True):
             turn = rng.uniform(-own.turn_rad, own.turn_rad)
             rotation = tilted(tilt, axis, turn)
-            height = own.height_sigma_m * rng.normal()
-            out.append(_see(own, g, rotation, height, factor, visit, len(out), rng))
-    return out
+            yield Shot(g, rotation, own.height_sigma_m * rng.normal(), factor, visit)
 
 
-def _see(
-    own: Microscope,
-    g: float,
-    rotation: Array,
-    height_m: float,
-    factor: float,
-    visit: int,
-    number: int,
-    rng: np.random.Generator,
-) -> SeenGrid:
+def record(own: Microscope) -> list[SeenGrid]:
+    """The corners of a recording."""
+    rng = np.random.default_rng((own.seed, own.index, 1))
+    return [_see(own, shot, number, rng) for number, shot in enumerate(take_shots(own, rng))]
+
+
+def _see(own: Microscope, shot: Shot, number: int, rng: np.random.Generator) -> SeenGrid:
     """The corners in one picture; the numbers of the lattice start near the middle, in any of its four directions."""
+    g = shot.magnification
     side = own.square_m(g)
     # So many squares that a strongly tilted grid fills the picture from corner to corner.
     reach = int(np.ceil(1.8 * DISPLAY_WIDTH_M / g / side)) + 2
     i, j = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
     ij = np.stack([i.ravel(), j.ravel()], axis=1)
     flat = ij * side + side * rng.uniform(-0.5, 0.5, 2)
-    points = flat @ rotation[:, :2].T + [0.0, 0.0, height_m]
+    points = flat @ shot.rotation[:, :2].T + [0.0, 0.0, shot.height_m]
     # Far outside the equations of the lens mean nothing.
-    ideal = own.project_ideal(g, points, factor)
+    ideal = own.project_ideal(g, points, shot.factor)
     with np.errstate(invalid="ignore"):
         near = np.all(np.abs(ideal - own.middle) < 0.7 * own.size, axis=1)
     ij, true = ij[near], own.deflect(g, ideal[near])
@@ -396,4 +403,4 @@ def _see(
     ij = ij - ij[np.argmin(np.sum((xy - own.middle) ** 2, axis=1))]
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[rng.integers(4)]
     board = side * (ij @ np.array([[c, s], [-s, c]])).astype(np.float64)
-    return SeenGrid(g, board, xy, side, visit, f"{number}")
+    return SeenGrid(g, board, xy, side, shot.visit, f"{number}")

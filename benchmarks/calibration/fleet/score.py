@@ -47,6 +47,7 @@ from benchmarks.calibration.fleet.microscope import (
     record,
     tilted,
 )
+from benchmarks.calibration.fleet.pictures import shrink, views_of_pictures
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
@@ -197,14 +198,21 @@ def misstate_one(own: Microscope, views: Sequence[GridView]) -> tuple[list[GridV
 
 
 def judge(
-    seed: int, index: int, *, misstate: bool = False, other_physics: bool = False
+    seed: int,
+    index: int,
+    *,
+    misstate: bool = False,
+    other_physics: bool = False,
+    pictures: bool = False,
 ) -> tuple[Outcome, str]:
     """The outcome of one microscope, and the traceback if there is one.
 
-    With ``misstate`` the magnification of one view is wrong (:func:`misstate_one`).
+    With ``misstate`` the magnification of one view is wrong (:func:`misstate_one`); with ``pictures`` the corners are
+    those that are found in pictures (:mod:`benchmarks.calibration.fleet.pictures`).
     """
     own = draw_microscope(seed, index, other_physics=other_physics)
-    views = views_of(own)
+    own = shrink(own) if pictures else own
+    views = list(views_of_pictures(own)) if pictures else views_of(own)
     wrong, factor = "", 1.0
     if misstate:
         views, chosen, factor = misstate_one(own, views)
