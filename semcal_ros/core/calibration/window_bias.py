@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.thresholds import WINDOW_BIAS_PART
+from semcal_ros.core.calibration.thresholds import BEND_STEP_PX, WINDOW_BIAS_PART
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_distortion import (
@@ -40,8 +40,6 @@ from semcal_ros.core.camera.scan_distortion import (
 )
 from semcal_ros.core.camera.thresholds import SETTLING_TIMES
 from semcal_ros.core.corners.local_map import fit_local_maps
-
-_STEP_PX = 0.05
 
 
 def find_window_bias(view: GridView, amplitudes: Array, raster: Raster) -> Array:
@@ -79,7 +77,7 @@ def find_window_bias(view: GridView, amplitudes: Array, raster: Raster) -> Array
     def stretch(by_px: float) -> Array:
         return deflection_stretch(xy[known] + [by_px, 0.0], amplitudes, raster)[:, 0]
 
-    second = (stretch(_STEP_PX) - stretch(-_STEP_PX)) / (2.0 * _STEP_PX)
+    second = (stretch(BEND_STEP_PX) - stretch(-BEND_STEP_PX)) / (2.0 * BEND_STEP_PX)
     departs = np.stack([stretch(0.0) - 1.0 - slope, second - bend], axis=1)
     # The picture is displaced against the deflection.
     bias[known] = -np.einsum("nkc,nk->nc", response[known], departs)
