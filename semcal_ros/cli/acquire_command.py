@@ -141,6 +141,12 @@ class AcquisitionOptions:
                 f"--resume {resume} does not exist",
                 expected="the recording of an interrupted acquisition",
             )
+        if not (self.microscope or self.by_hand):
+            raise InvalidValueError(
+                "--microscope without a name",
+                expected="the name of a node, such as virtual_sem",
+                do="take --by-hand to set the microscope yourself",
+            )
         if not self.namespace.startswith("/"):
             raise InvalidValueError(
                 f"--namespace {self.namespace}", expected="a name that begins with /"

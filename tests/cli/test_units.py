@@ -95,6 +95,7 @@ def test_bare_tilts_are_degrees(command: click.Command, text: str) -> None:
         ),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--resume", "gone"), "does not exist"),
         (("acquire", "-o", "c.yaml"), "neither --range nor --extend"),
+        (("acquire", "-o", "c.yaml", "--range", "1,2", "--microscope", ""), "without a name"),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--extend", "c"), "--range and --extend"),
         (("acquire", "-o", "c.yaml", "--extend", "c.yaml"), "--extend without --to"),
         (("acquire", "-o", "c.yaml", "--range", "1,2", "--to", "9x"), "--to without --extend"),

@@ -114,6 +114,16 @@ def resumed(command: list[str], views: Path, timeout_s: float) -> subprocess.Com
     )
 
 
+def test_a_microscope_that_no_node_can_be_is_refused(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "semcal_ros", "acquire", "-o", str(tmp_path / "cal.yaml")]
+    command += ["--range", "1500,3000", "--microscope", "my microscope"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "microscope 'my microscope'; expected the name of a node, such as virtual_sem"
+    ]
+
+
 @pytest.mark.long
 def test_semcal_acquire_calibrates_the_virtual_microscope_and_goes_on_after_ctrl_c(
     tmp_path: Path,

@@ -24,11 +24,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import NameValidationException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from semcal_ros.config.config import StageConfig
-from semcal_ros.core.errors import MicroscopeError
+from semcal_ros.core.errors import InvalidValueError, MicroscopeError
 from semcal_ros.nodes.common.context import NodeContext
 from semcal_ros.nodes.common.qos import latched
 
@@ -52,6 +53,11 @@ class MicroscopeCommands:
         Name of the node that is asked.
     still_wanted
         Asked while waiting; if it returns False, the wait ends with an error.
+
+    Raises
+    ------
+    InvalidValueError
+        If no node can have that name.
     """
 
     def __init__(self, context: NodeContext, name: str, still_wanted: Callable[[], bool]) -> None:
@@ -62,7 +68,12 @@ class MicroscopeCommands:
         self._changed = threading.Condition()
         self._answer: dict[str, str] = {}
         self._text = ""
-        self._magnification = endpoints.stream_publisher(Float64, f"{name}/set_magnification")
+        try:
+            self._magnification = endpoints.stream_publisher(Float64, f"{name}/set_magnification")
+        except NameValidationException as error:
+            raise InvalidValueError(
+                f"microscope {name!r}", expected="the name of a node, such as virtual_sem"
+            ) from error
         self._move = endpoints.stream_publisher(JointState, f"{name}/move_stage")
         group = MutuallyExclusiveCallbackGroup()
         self._motion = endpoints.subscribe(
