@@ -26,7 +26,7 @@ import click
 
 from semcal_ros.calibration import Calibration
 from semcal_ros.cli.extend_command import echo_pairs, echo_steps
-from semcal_ros.cli.options import options_of, refuse_grid_options, refuse_with
+from semcal_ros.cli.options import given_options, options_of, refuse_grid_options, refuse_with
 from semcal_ros.cli.output import (
     echo_notes,
     echo_rejected,
@@ -66,6 +66,14 @@ _OF_GRIDS = (
     "--paper",
     "--dask",
 )
+_OF_PDA = ("--pda-order", "--legendre", "--pda-step")
+_OF_JOINT = ("--breakpoints", "--residual")
+# Of each method, the options of the others.
+_OF_OTHER_METHODS = {
+    "joint": (*_OF_PDA, "--tau"),
+    "discrete": (*_OF_JOINT, *_OF_PDA),
+    "pda": _OF_JOINT,
+}
 
 
 @dataclass(frozen=True)
@@ -141,11 +149,14 @@ def command(
     if specimen:
         _calibrate_specimen(recording, output, config, known)
         return
-    for name, value in (("--length", known.length), ("--stage-scale", known.stage_scale)):
-        if value is not None:
+    for name in ("--length", "--stage-scale", "--known-sigma"):
+        if name in given_options():
             raise InvalidValueError(
                 f"{name} without --specimen", expected="both", do="add --specimen"
             )
+    refuse_with(
+        f"--method {options.method}", "which does not use it", _OF_OTHER_METHODS[options.method]
+    )
     asked = replace(options, config=config, options=paper_options)
     with show_progress() as on_progress:
         done = calibrate_recording(

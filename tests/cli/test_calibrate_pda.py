@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,3 +172,22 @@ def test_a_step_that_is_none_is_refused(tmp_path, capsys):
     for text in ("best", "-500", "nan"):
         line = refused(capsys, "calibrate", "grid", "-o", tmp_path / "c.yaml", "--pda-step", text)
         assert "auto" in line
+
+
+@pytest.mark.parametrize(
+    ("method", "option", "value"),
+    [
+        ("joint", "--tau", "3"),
+        ("joint", "--pda-order", "2"),
+        ("pda", "--residual", "on"),
+        ("pda", "--breakpoints", "900"),
+        ("discrete", "--legendre", "3"),
+    ],
+)
+def test_options_of_another_method_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str, option: str, value: str
+) -> None:
+    arguments = ("calibrate", tmp_path, "-o", tmp_path / "c.yaml", "--method", method)
+    (tmp_path / "a.png").touch()
+    line = refused(capsys, *arguments, option, value)
+    assert f"{option} with --method {method}, which does not use it" in line
