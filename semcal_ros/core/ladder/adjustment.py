@@ -26,6 +26,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from semcal_ros.core.arrays import Array, equilibrate, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.thresholds import DAMPING_MIN
@@ -53,6 +55,7 @@ from semcal_ros.core.ladder.thresholds import (
     VIBRATION_PX,
 )
 from semcal_ros.core.ladder.unknowns import LadderSetup, LadderState, jump_sigmas, slope_sigma
+from semcal_ros.core.wording import counted
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,7 @@ def adjust(
     Raises
     ------
     CalibrationError
-        If the adjustment does not converge.
+        If the adjustment does not converge, or if without the pairs that contradict the others some pictures have none.
     """
     fit = _adjust(setup, state, links, on_progress, DRIFT_MAX * setup.image_size[1])
     if max(fit.drift.steady_px, fit.drift.change_px) <= SETTLED_DRIFT_PX:
@@ -234,6 +237,7 @@ def _adjust(
         if not np.any(bad):
             break
         kept = tuple(k for k, wrong in zip(kept, bad, strict=True) if not wrong)
+        _refuse_loose_pictures(setup, links, kept)
     if descent.status in (DescentStatus.ITERATION_LIMIT, DescentStatus.SINGULAR):
         raise CalibrationError(
             f"an adjustment of {len(kept)} pairs of pictures that did not end: {descent.status.value}",
@@ -251,6 +255,24 @@ def _adjust(
     excess = max(factor, 1.0)
     covariance = invert_scaled(matrix / excess + np.diag(information))
     return LadderFit(state, covariance, factor, factors, drift, jumps, kept, descent)
+
+
+def _refuse_loose_pictures(setup: LadderSetup, links: Sequence[Link], kept: Sequence[int]) -> None:
+    """Refuse pictures of which a part has no pair with the others any more: nothing would tell where it lies."""
+    size = len(setup.pictures)
+    pairs = np.array([(links[k].first, links[k].second) for k in kept], dtype=np.intp).reshape(
+        -1, 2
+    )
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(size, size))
+    _, part = connected_components(graph, directed=False)
+    loose = size - int(np.max(np.bincount(part)))
+    if loose:
+        raise CalibrationError(
+            f"pairs of pictures that contradict each other: without the {len(links) - len(kept)} of "
+            f"{counted(len(links), 'pair')} that do most, {counted(loose, 'picture')} of {size} cannot be placed",
+            expected="pictures that agree on one specimen at rest",
+            do="use a specimen that neither repeats itself, moves nor charges",
+        )
 
 
 def _settle(

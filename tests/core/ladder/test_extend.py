@@ -193,6 +193,23 @@ def test_turned_scans_tell_aspect_and_skew() -> None:
 
 
 @pytest.mark.long
+def test_a_picture_that_contradicts_all_others_is_refused() -> None:
+    # As where a specimen repeats itself: each pair has another wrong place.
+    steps = STEPS[1:3]
+    state, links = _links_of_truth(0.05, 0, steps=steps)
+    last = 4 * len(steps) - 1
+    rng = np.random.default_rng(5)
+    wrong = [
+        replace(link, second_xy=link.second_xy + rng.normal(0.0, 9.0, 2))
+        if link.second == last
+        else link
+        for link in links
+    ]
+    with pytest.raises(CalibrationError, match=f"1 picture of {last + 1} cannot be placed"):
+        adjust(state.setup, state, wrong)
+
+
+@pytest.mark.long
 def test_a_tilt_is_seen_by_its_perspective_and_refused() -> None:
     # A tenth of the field higher or lower, under a pivot at 20 mm, is some tenths of a pixel at 360x: the slope is
     # known to 0.01.
