@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +27,11 @@ import numpy as np
 
 from semcal_ros.applications.reconstruction.tilt_series import HeightMap, measure_heights
 from semcal_ros.bridge.images import to_gray
+from semcal_ros.calibration import Calibration
+from semcal_ros.config.config import MicroscopeConfig
+from semcal_ros.core.arrays import AnyImage, Mask
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
 from semcal_ros.files.images.write import TIFF_SUFFIXES, PixelScale, open_tiff_stack
 from semcal_ros.files.meshes import UNITS_PER_M, save_cloud
@@ -164,7 +169,8 @@ class ReliefOptions:
         ),
     ] = None
     calibration: Annotated[
-        CalibrationSource | None, Keyword("Gives the pixel size and its 1-sigma.")
+        CalibrationSource | None,
+        Keyword("Takes distortion out of the pictures, and gives the pixel size and its 1-sigma."),
     ] = None
     config: Annotated[ConfigSource | None, CONFIG] = None
     on_progress: Annotated[OnProgress, PROGRESS] = ignore_progress
@@ -213,6 +219,8 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
         )
     tilts = _read_tilts(frames) if tilts_rad is None else tilts_rad
     camera = camera_for(frames[0], model, microscope)
+    if model is not None:
+        camera = camera.rectified
     size = camera.pixel_size_m[0]
     sigma = None if model is None or camera.covariance is None else max(camera.pixel_size_sigma_m)
     if sigma is None:
@@ -220,10 +228,16 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
             "the pixel size is nominal: its uncertainty is not in the 1-sigma of the heights"
         )
     else:
-        notes.append("the calibration gives the pixel size; distortion is left in the pictures")
+        notes.append("the pictures are rectified by the calibration, which gives the pixel size")
+    if len(frames) == 2:
+        notes.append(
+            "two pictures do not tell a slope of the whole field from a drift within a frame, which is not in the "
+            f"1-sigma: a drift of 1 px over a frame may tilt the relief by {_slope_deg(frames[0], tilts):.2g} degrees"
+        )
     on_progress("measuring heights", 0, None)
+    pictures, masks = zip(*(_flatten(frame, model, microscope) for frame in frames), strict=True)
     found = measure_heights(
-        [to_gray(frame.visible, frame.encoding) for frame in frames],
+        pictures,
         tilts,
         size,
         pixel_size_sigma_m=sigma or 0.0,
@@ -233,6 +247,7 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
         axis_rad=(
             np.radians(stage.tilt_axis_deg if stage else 0.0) if axis_rad is None else axis_rad
         ),
+        masks=masks,
     )
     if axis_rad is None:
         notes.append(
@@ -246,6 +261,26 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
             "the tilts are not as stated, or --tilt-sigma is too small"
         )
     return Relief(found, PixelScale(size, sigma), tuple(notes))
+
+
+def _flatten(
+    frame: RecordedFrame, model: Calibration | None, microscope: MicroscopeConfig
+) -> tuple[AnyImage, Mask | None]:
+    """Return the grey levels of a frame, rectified where there is a calibration, and where they show the specimen."""
+    grey = to_gray(frame.visible, frame.encoding)
+    if model is None:
+        return grey, frame.mask
+    camera, rectifier = camera_for(frame, model, microscope), Rectifier("cubic")
+    shown = np.ones(grey.shape, np.float32) if frame.mask is None else frame.mask.astype(np.float32)
+    # What was not scanned is zero, too.
+    scanned = np.asarray(rectifier.rectify(shown, camera), dtype=np.float32)
+    return rectifier.rectify(grey, camera), scanned > 0.99
+
+
+def _slope_deg(frame: RecordedFrame, tilts_rad: Sequence[float]) -> float:
+    """Apparent slope of a flat specimen that moves by 1 px, down or up, while the frame is taken."""
+    turn = abs(math.tan(tilts_rad[1] - tilts_rad[0]))
+    return math.degrees(math.atan(1.0 / (frame.image.shape[0] * turn)))
 
 
 def _read_tilts(frames: Sequence[RecordedFrame]) -> list[float]:

@@ -307,6 +307,11 @@ GREY_WINDOW_PX = TABLE.stated(
     "GREY_WINDOW_PX", 2.5, "px",
     "1-sigma of the window in which grey levels are compared.",
 )
+WINDOW_REACH = TABLE.derived(
+    "WINDOW_REACH", 3.0, "sigmas",
+    "Of this window, within which a pixel that does not show the specimen spoils a height: 0.3 % of it lies beyond "
+    "along either axis.",
+)
 MATCH_STEPS = TABLE.derived(
     "MATCH_STEPS", 3, "steps",
     "Of the refinement, each of which gives back what the window smoothed away; NOISE_GAIN is that of three.",

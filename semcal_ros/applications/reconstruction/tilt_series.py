@@ -57,6 +57,7 @@ from semcal_ros.applications.reconstruction.thresholds import (
     PARALLAX_MIN,
     TILT_STEP_MAX_RAD,
     TILT_STEP_MIN_RAD,
+    WINDOW_REACH,
 )
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask, check_positive, mad_sigma
 from semcal_ros.core.errors import InvalidValueError, StructureError
@@ -109,7 +110,13 @@ class Disparity:
     sigma_px: Array
 
 
-def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: float) -> TiltGeometry:
+def find_tilt_geometry(
+    first: AnyImage,
+    second: AnyImage,
+    *,
+    near_axis_rad: float,
+    shown: tuple[Mask | None, Mask | None] = (None, None),
+) -> TiltGeometry:
     """Match SIFT features both ways and fit the affine epipolar geometry that they agree on.
 
     Parameters
@@ -118,13 +125,15 @@ def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: floa
         (h, w) grey levels.
     near_axis_rad
         Of the two senses of the axis, the one within 90 degrees of this is meant.
+    shown
+        (h, w) true where the first and the second show the specimen; None for all of it.
 
     Raises
     ------
     StructureError
         If too few matches agree, they show no parallax, or the pictures have too little in common.
     """
-    one, two = _match_features(first, second)
+    one, two = _match_features(first, second, shown)
     if OVERLAP_MATCHES <= len(one) < MATCHES_MIN:
         _check_overlap(one, two, first, second)
     if len(one) < MATCHES_MIN:
@@ -189,7 +198,11 @@ def find_tilt_geometry(first: AnyImage, second: AnyImage, *, near_axis_rad: floa
 
 
 def match_densely(
-    first: AnyImage, second: AnyImage, geometry: TiltGeometry, tilt_rad: float
+    first: AnyImage,
+    second: AnyImage,
+    geometry: TiltGeometry,
+    tilt_rad: float,
+    shown: tuple[Mask | None, Mask | None] = (None, None),
 ) -> Disparity:
     """Find the disparity ``v' / (scale cos t) - v`` of every pixel: semi-global search, then least squares.
 
@@ -204,6 +217,8 @@ def match_densely(
         Of the two.
     tilt_rad
         Tilt of the second picture against the first.
+    shown
+        As of :func:`find_tilt_geometry`.
     """
     width = int(np.ceil(np.hypot(*first.shape[:2])))
     middle = 0.5 * (width - 1)
@@ -216,8 +231,8 @@ def match_densely(
     shift = np.median(across - here, axis=0)
     parallax = (across - here)[:, 0] - shift[0]
     reach = 1.5 * float(np.max(np.abs(np.percentile(parallax, (0.5, 99.5))))) + 8.0
-    left, left_seen = _resample(first, ours, middle, (0.0, 0.0))
-    right, right_seen = _resample(second, theirs, middle, shift)
+    left, left_seen = _resample(first, shown[0], ours, middle, (0.0, 0.0))
+    right, right_seen = _resample(second, shown[1], theirs, middle, shift)
     disparity, valid = _search(left, right, left_seen, right_seen, int(np.ceil(reach / 8.0)) * 8)
     refined, sigma = _refine(left, right, disparity, valid & left_seen, right_seen)
     refined = refined + shift[0]
@@ -255,11 +270,15 @@ def _to_bytes(image: AnyImage) -> NDArray[np.uint8]:
     return np.clip(scaled, 0, 255).astype(np.uint8)
 
 
-def _match_features(first: AnyImage, second: AnyImage) -> tuple[Array, Array]:
+def _match_features(
+    first: AnyImage, second: AnyImage, shown: tuple[Mask | None, Mask | None]
+) -> tuple[Array, Array]:
     """Match features of two images, each the best for the other; a place that has two orientations counts once."""
     finder = cv2.SIFT.create(nfeatures=8000)
-    points, described = finder.detectAndCompute(_to_bytes(first), None)
-    others, other_described = finder.detectAndCompute(_to_bytes(second), None)
+    (points, described), (others, other_described) = (
+        finder.detectAndCompute(_to_bytes(image), None if mask is None else mask.astype(np.uint8))
+        for image, mask in zip((first, second), shown, strict=True)
+    )
     if min(len(points), len(others)) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
@@ -339,7 +358,11 @@ def _affine(
 
 
 def _resample(
-    image: AnyImage, matrix: Array, middle: float, shift: Array | tuple[float, float]
+    image: AnyImage,
+    shown: Mask | None,
+    matrix: Array,
+    middle: float,
+    shift: Array | tuple[float, float],
 ) -> tuple[Image, Mask]:
     size = round(2 * middle + 1)
     warp = _affine(matrix, _centre_of(image), middle, shift)
@@ -347,7 +370,7 @@ def _resample(
     out = cv2.warpAffine(
         image.astype(np.float32), warp, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    inside = np.ones(image.shape[:2], np.uint8)
+    inside = np.ones(image.shape[:2], np.uint8) if shown is None else shown.astype(np.uint8)
     seen = cv2.warpAffine(
         inside, warp, (size, size), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     )
@@ -555,6 +578,7 @@ def measure_heights(
     pixel_size_sigma_m: float = 0.0,
     tilt_sigma_rad: float,
     axis_rad: float = 0.0,
+    masks: Sequence[Mask | None] | None = None,
 ) -> HeightMap:
     """Measure heights in two or three tilted pictures.
 
@@ -570,6 +594,9 @@ def measure_heights(
         1-sigma of each tilt.
     axis_rad
         About where the tilt axis points in the image, from +x towards +y; it decides between hills and dents.
+    masks
+        For each picture (h, w) true where it shows the specimen, or None for all of it. There are no heights where the
+        window of the matching reaches what it does not show.
 
     Raises
     ------
@@ -594,16 +621,24 @@ def measure_heights(
     # The middle one of three shares most with both others; of two, the one tilted less.
     reference = int(order[1]) if len(images) == 3 else int(np.argmin(np.abs(tilts_rad)))
     others = [index for index in range(len(images)) if index != reference]
+    shown = [_shrink(mask) for mask in masks or [None] * len(images)]
     pairs = []
     for other in others:
-        pair = find_tilt_geometry(images[reference], images[other], near_axis_rad=axis_rad)
+        pair = find_tilt_geometry(
+            images[reference],
+            images[other],
+            near_axis_rad=axis_rad,
+            shown=(shown[reference], shown[other]),
+        )
         _check_axis(pair, axis_rad)
         pairs.append(pair)
     turns = [tilts_rad[other] - tilts_rad[reference] for other in others]
     u, v = _coordinates(images[reference].shape, pairs[0].axis_rad, pixel_size_m)
     heights, noises = [], []
     for other, pair, turn in zip(others, pairs, turns, strict=True):
-        found = match_densely(images[reference], images[other], pair, turn)
+        found = match_densely(
+            images[reference], images[other], pair, turn, (shown[reference], shown[other])
+        )
         depth = found.value_px * pixel_size_m / np.tan(turn)
         _check_coverage(depth)
         heights.append(depth - np.nanmedian(depth))
@@ -636,6 +671,16 @@ def measure_heights(
         ratio,
         ratio_sigma,
     )
+
+
+def _shrink(mask: Mask | None) -> Mask | None:
+    """Return a mask without the pixels whose windows reach beyond it."""
+    if mask is None:
+        return None
+    reach = int(np.ceil(WINDOW_REACH * GREY_WINDOW_PX))
+    # What lies beyond the picture is no reason: it is continued there.
+    kept = cv2.erode(mask.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8))
+    return np.asarray(kept > 0)
 
 
 def _check_tilts(ascending: Array) -> None:

@@ -167,8 +167,8 @@ def test_a_false_match_on_its_epipolar_line_does_not_turn_the_axis(
 ) -> None:
     images, match = scene[0], tilt_series._match_features
 
-    def with_a_false_one(first: Array, second: Array) -> tuple[Array, Array]:
-        one, two = match(first, second)
+    def with_a_false_one(first: Array, second: Array, shown: object) -> tuple[Array, Array]:
+        one, two = match(first, second, shown)
         across = np.array([-np.sin(AXIS_RAD), np.cos(AXIS_RAD)])
         # 70 px along the line, and 1 px off it, which is within the tolerance.
         wrong = two[:1] + 70.0 * across + np.array([np.cos(AXIS_RAD), np.sin(AXIS_RAD)])
@@ -182,6 +182,23 @@ def test_a_false_match_on_its_epipolar_line_does_not_turn_the_axis(
     assert np.max(np.abs(shifts - np.median(shifts))) < 20.0
     # Other samples of RANSAC leave a match more or less at the limit. The false one turned the axis by 1/70 rad.
     assert found.axis_rad == pytest.approx(plain.axis_rad, abs=np.sqrt(plain.covariance[0, 0]))
+
+
+def test_what_is_masked_has_no_heights_and_spoils_none(scene: tuple[list[Array], Array]) -> None:
+    images, truth = scene
+    mask = np.ones(truth.shape, dtype=np.bool_)
+    mask[60:130, 70:150] = False
+    # As of a bright tip that does not move with the specimen, with an edge that would be matched.
+    covered = [np.where(mask, image, 2.0 * np.max(image)) for image in images]
+    found = measure_heights(
+        covered, _TILTS_RAD, _PIXEL_M, tilt_sigma_rad=_TILT_SIGMA_RAD, masks=[mask] * 3
+    )
+    assert not np.any(np.isfinite(found.height_m[~mask]))
+    scores = _scores(found, truth)
+    assert 0.7 < np.sqrt(np.mean(scores**2)) < 1.4
+    assert found.coverage > 0.4
+    untold = measure_heights(covered, _TILTS_RAD, _PIXEL_M, tilt_sigma_rad=_TILT_SIGMA_RAD)
+    assert np.any(np.isfinite(untold.height_m[~mask]))
 
 
 @pytest.mark.parametrize(("shift", "share"), [((212.0, 0.0), "12"), ((0.0, -222.0), "[78]")])
