@@ -47,7 +47,7 @@ SAMPLES = 3
 MARGIN_PX = 6
 PATTERNS = ("chess", "chess", "chess", "dots", "crosses", "lines")
 # The lens moves a pixel by some percent of the others' moves, so that an error falls tenfold in each round.
-_ROUNDS, _SETTLING_ROUNDS = 12, 60
+_LENS_ROUNDS, _AXIS_ROUNDS = 12, 60
 
 
 def shrink(own: Microscope) -> Microscope:
@@ -76,14 +76,13 @@ def views_of_pictures(own: Microscope) -> tuple[GridView, ...]:
     """The views that are found in the pictures of a recording."""
     rng = np.random.default_rng((own.seed, own.index, 5))
     pattern = PATTERNS[int(rng.integers(len(PATTERNS)))]
-    ideal: dict[float, Array] = {}
     found: list[tuple[Shot, LatticeDetection]] = []
+    last_g = 0.0
     for shot in take_shots(own, rng):
-        g = shot.magnification
-        if g not in ideal:
-            # The last one is not looked at again before all others are.
-            ideal = {g: ideal_from_raw(own, g)}
-        seen = find_lattice(draw_picture(own, shot, ideal[g], pattern, rng))
+        if shot.magnification != last_g:
+            last_g = shot.magnification
+            ideal = ideal_from_raw(own, last_g)
+        seen = find_lattice(draw_picture(own, shot, ideal, pattern, rng))
         if isinstance(seen, LatticeDetection):
             found.append((shot, seen))
     views, _ = views_from_detections(
@@ -107,7 +106,7 @@ def ideal_from_raw(own: Microscope, g: float) -> Array:
     lens = replace(own, coil_px=(0.0, 0.0), settling_px=0.0)
     target = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     at = target.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_LENS_ROUNDS):
         at += target - lens.deflect(g, at)
     return at.reshape(len(row), len(column), 2)
 
@@ -119,7 +118,7 @@ def _before_settling(own: Microscope, column: Array) -> Array:
     if own.settles_late:
         return np.asarray(column - push * np.exp(-np.maximum(column, -length) / length))
     x = column.copy()
-    for _ in range(_SETTLING_ROUNDS):
+    for _ in range(_AXIS_ROUNDS):
         slope = np.where(
             x > -length, -push / length * np.exp(-np.maximum(x, -length) / length), 0.0
         )
@@ -129,7 +128,7 @@ def _before_settling(own: Microscope, column: Array) -> Array:
 
 def _before_coil(own: Microscope, pixel: Array, axis: int) -> Array:
     at = pixel.copy()
-    for _ in range(_SETTLING_ROUNDS):
+    for _ in range(_AXIS_ROUNDS):
         z = 2.0 * (at - own.middle[axis]) / own.size[axis]
         at += pixel - at - own.coil_px[axis] * (own.add_to_ramp(z) + 0.4 * z * z)
     return at
@@ -151,8 +150,8 @@ def draw_picture(
     u, v = np.moveaxis(
         point @ shot.rotation[:, :2] / own.square_m(g) + rng.uniform(-0.5, 0.5, 2), 2, 0
     )
-    # Edges as wide as a sample.
-    soft = 0.5 / SAMPLES * own.scale(g) ** -1 / own.square_m(g)
+    # Edges as wide as a sample: half of one, in squares.
+    soft = 0.5 / (SAMPLES * own.scale(g) * own.square_m(g))
     bright = _PATTERNS[pattern](u, v, soft)
     blur_px, electrons = draws.between(0.7, 1.3), draws.ratio(100.0, 1000.0)
     smooth = ndimage.gaussian_filter(bright, SAMPLES * blur_px)

@@ -357,9 +357,9 @@ START_RHO_MAX = TABLE.derived(
 )
 WINDOW_BIAS_PART = TABLE.measured(
     "WINDOW_BIAS_PART", 0.5, "ratio",
-    "Sigma of the bias of a window that is taken out, over this bias. With checkerboards, crosses, dots and lines 25 to "
-    "45 px apart, and decays of 4, 8 and 12 columns, 0 to 0.67 of the bias was left (RMS, less the noise) on 30 "
-    "November 2026, and 0.93 at most with points 60 to 70 px apart.",
+    "Sigma of the bias of a window that is taken out, over this bias. Of chess, crosses, dots and lines 20 to 60 px "
+    "apart, settling by 3 px over 6, 12 and 24 columns, PART_TEXT of the bias is left (RMS, less the noise; 30 November "
+    "2026).",
     command="python -m benchmarks.calibration.settling",
 )
 BEND_STEP_PX = TABLE.derived(
@@ -367,9 +367,17 @@ BEND_STEP_PX = TABLE.derived(
     "Of the central difference that gives the bend of the scan: 1e-4 of it is wrong where the beam settles over 3 "
     "columns, (step / decay)^2 / 6.",
 )
+BIAS_NEGLIGIBLE = TABLE.derived(
+    "BIAS_NEGLIGIBLE", 0.01, "sigmas",
+    "Decays of so little are none: where the beam has settled, a bias is that of the coils, and is taken out at once.",
+)
 WINDOW_BIAS_SETTLED = TABLE.derived(
     "WINDOW_BIAS_SETTLED", 0.3, "sigmas",
     "By which corners move at most from one fit to the next: 0.1 more of the chi-square of a corner, which is 2.",
+)
+WINDOW_BIAS_LEFT = TABLE.defined(
+    "WINDOW_BIAS_LEFT", 3.0, "sigmas",
+    "More than what noise does to a corner is told.",
 )
 WINDOW_BIAS_ROUNDS = TABLE.cost(
     "WINDOW_BIAS_ROUNDS", 4, "fits",

@@ -105,6 +105,11 @@ class GridView:
                 f"covariances of shape {self.covariance_px2.shape}",
                 expected=f"positive definite ones of shape ({n}, 2, 2)",
             )
+        if self.scan_response is not None and self.scan_response.shape != (n, 2, 2):
+            raise InvalidValueError(
+                f"responses to the scan of shape {self.scan_response.shape}",
+                expected=f"({n}, 2, 2)",
+            )
 
     @property
     def has_stage_tilt(self) -> bool:
@@ -149,7 +154,8 @@ class GridView:
             sigma_px=self.sigma_px[keep],
             covariance_px2=spread,
             across=None if self.across is None else self.across[keep],
-            scan_response=None if self.scan_response is None else self.scan_response[keep],
+            # With the others it was that of another lattice.
+            scan_response=None,
         )
 
     @property

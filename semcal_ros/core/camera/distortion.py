@@ -41,7 +41,7 @@ from semcal_ros.core.camera.thresholds import LENS_STEPS_MAX, LENS_TOLERANCE
 
 LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u", "xi_v", "xi_w")
 """The coefficients, in the order in which the functions below take and derive them."""
-PRODUCTS: tuple[str, ...] = LENS_NAMES[-2:]
+PRODUCTS: tuple[str, ...] = ("xi_v", "xi_w")
 """Those of the products of both coordinates."""
 
 

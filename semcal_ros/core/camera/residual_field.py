@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices
-from semcal_ros.core.camera.distortion import PRODUCTS, distort_jacobians
+from semcal_ros.core.camera.distortion import LENS_NAMES, PRODUCTS, distort_jacobians
 from semcal_ros.core.camera.scan_distortion import scan_functions
 from semcal_ros.core.camera.thresholds import (
     FIELD_BREAKS_X,
@@ -318,7 +318,8 @@ class ResidualField:
         patterns = [(one, zero), (zero, one), (x, zero), (y, zero), (zero, x), (zero, y)]
         # A term of the lens that is small is its derivative.
         of_lens = np.moveaxis(distort_jacobians(q, 0.0, 0.0)[2], (2, 1), (0, 1))
-        patterns += list(of_lens[: -len(PRODUCTS)])
+        names = zip(LENS_NAMES, of_lens, strict=True)
+        patterns += [pattern for name, pattern in names if name not in PRODUCTS]
         patterns += [(along, zero) for along in scan_functions(x, 0)]
         patterns += [(zero, across) for across in scan_functions(y / np.max(np.abs(y)), 1)]
         basis = self.at(self.g_range[0]).basis(q) * weight[:, None]

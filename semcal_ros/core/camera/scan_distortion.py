@@ -193,6 +193,12 @@ def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:
     return out
 
 
+def settling_decay(x: Array, amplitudes: Array, raster: Raster) -> Array:
+    """Return the sum of the decays (n,), with nothing taken out, at raw columns ``x`` (n,), in half image widths."""
+    u = np.clip((x - raster.middle_px[0]) / raster.norm_px, -SCAN_END, SCAN_END)
+    return np.asarray(np.exp(_RATES * (1.0 + u)[:, None]) @ amplitudes[SETTLING])
+
+
 def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return the raw pixels (n, 2) at which the beam is deflected to ``deflection`` (n, 2), px.
 

@@ -33,8 +33,14 @@ from semcal_ros.core.calibration.window_bias import (
     find_window_bias,
     undo_window_bias,
 )
-from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster, deflection_shift
+from semcal_ros.core.camera.scan_distortion import (
+    SCAN_NAMES,
+    Raster,
+    deflection_shift,
+    settling_decay,
+)
 from semcal_ros.core.corners import LatticeDetection, find_lattice
+from semcal_ros.core.errors import InvalidValueError
 from tests.helpers.long_tests import long_but
 
 WIDTH, HEIGHT = 512, 384
@@ -146,7 +152,7 @@ def test_without_settling_or_without_what_a_fit_says_nothing_is_taken_out() -> N
     found = find_lattice(draw("chess", 30.0, 0.3, np.zeros(len(SCAN_NAMES))))
     assert isinstance(found, LatticeDetection)
     view = view_of(found)
-    assert not np.any(find_window_bias(view, amplitudes_of("coil_x3", 2.0), RASTER))
+    assert not np.any(find_window_bias(view, amplitudes_of("coil_y3", 2.0), RASTER))
     amplitudes = amplitudes_of("settling_3", 3.0)
     assert np.any(find_window_bias(view, amplitudes, RASTER))
     assert not np.any(find_window_bias(replace(view, scan_response=None), amplitudes, RASTER))
@@ -166,15 +172,47 @@ def test_a_decay_that_was_fitted_to_biased_corners_tells_the_bias_in_one_step() 
     bias = find_window_bias(view, true, RASTER)
     # Of one corner: its decay is fitted a times too large.
     nearest = int(np.argmax(np.abs(bias[:, 0])))
-    decay = np.exp(
-        -(1.0 + (view.image_xy[nearest, 0] - RASTER.middle_px[0]) / RASTER.norm_px) / 0.0469
-    )
+    decay = 0.5 * WIDTH * settling_decay(view.image_xy[:, 0], true, RASTER)[nearest]
     a = np.linalg.norm(bias[nearest]) / decay
     assert a > 0.02
-    approached = approach_window_bias(view, np.zeros_like(bias), (1.0 + a) * true, RASTER)
-    np.testing.assert_allclose(approached[nearest], bias[nearest], rtol=1e-9)
+    approached, left = approach_window_bias(view, np.zeros_like(bias), (1.0 + a) * true, RASTER)
+    # The decay of the points that are not near the border is not quite nothing.
+    np.testing.assert_allclose(approached[nearest], bias[nearest], rtol=1e-3)
+    np.testing.assert_allclose(left, (1.0 + a) * bias, atol=1e-9)
 
 
+def test_what_the_coils_do_is_taken_out_at_once() -> None:
+    found = find_lattice(draw("dots", 30.0, 0.3, np.zeros(len(SCAN_NAMES))), pattern="dots")
+    assert isinstance(found, LatticeDetection)
+    view = view_of(found)
+    coils = amplitudes_of("coil_x7", 1.0)
+    bias = find_window_bias(view, coils, RASTER)
+    assert np.max(np.abs(bias)) > np.min(view.sigma_px)
+    approached, _ = approach_window_bias(view, np.zeros_like(bias), coils, RASTER)
+    np.testing.assert_allclose(approached, bias)
+
+
+def test_odd_views_have_no_bias() -> None:
+    found = find_lattice(draw("chess", 30.0, 0.3, np.zeros(len(SCAN_NAMES))))
+    assert isinstance(found, LatticeDetection)
+    view, settling = view_of(found), amplitudes_of("settling_3", 3.0)
+    # Of a part of the corners it would be that of another lattice.
+    assert view.chosen(np.arange(0, len(view.image_xy), 3)).scan_response is None
+    none = np.zeros((0, 2))
+    empty = GridView(
+        view.magnification,
+        none,
+        none,
+        np.zeros(0),
+        square_m=SQUARE_M,
+        scan_response=np.zeros((0, 2, 2)),
+    )
+    assert find_window_bias(empty, settling, RASTER).shape == (0, 2)
+    with pytest.raises(InvalidValueError, match="responses to the scan"):
+        replace(view, scan_response=np.zeros((3, 2, 2)))
+
+
+@pytest.mark.slow
 def test_a_calibration_is_not_led_astray_by_the_bias() -> None:
     # One decay that the camera has, 2 px over 12 columns, and corners that are moved as dots are.
     own = replace(
