@@ -357,9 +357,9 @@ START_RHO_MAX = TABLE.derived(
 )
 WINDOW_BIAS_PART = TABLE.measured(
     "WINDOW_BIAS_PART", 0.5, "ratio",
-    "Sigma of the bias of a window that is taken out, over this bias. Of chess, crosses, dots and lines 20 to 60 px "
-    "apart, settling by 3 px over 6, 12 and 24 columns, PART_TEXT of the bias is left (RMS, less the noise; 30 November "
-    "2026).",
+    "Sigma of the bias of a window that is taken out, over this bias. Of chess, crosses, dots and lines, settling by "
+    "3 px, 0 to 0.42 of the bias is left 20 to 45 px apart over 6, 12 and 24 columns, and to 0.09 at 60 px but over 6, "
+    "where it is 0.29 to 1.16 (RMS, less the noise; 30 November 2026).",
     command="python -m benchmarks.calibration.settling",
 )
 BEND_STEP_PX = TABLE.derived(

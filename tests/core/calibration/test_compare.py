@@ -90,6 +90,19 @@ def test_a_distortion_has_its_size(model: CalibrationModel) -> None:
     assert found.at[1].scale == pytest.approx(0.0, abs=1e-12)
 
 
+def test_an_aspect_is_not_hidden_by_an_uncertain_scale(model: CalibrationModel) -> None:
+    found = compare_calibrations(model, changed(model, "aspect", 1.002))
+    assert not found.agree
+    for one in found.at:
+        # Half the difference along each axis: 0.002 of the distance from the centre, but for a scale.
+        x, y = (one.xy - one.xy.mean(axis=0)).T
+        np.testing.assert_allclose(one.shape_px, 0.002 * np.stack([x, -y], 1), atol=0.03)
+    # The scale is known to 0.25 % there, which is more than that.
+    worst = max(found.at, key=lambda one: one.field_sigmas)
+    hidden = np.linalg.norm(worst.difference_px, axis=1) / worst.sigma_px
+    assert worst.field_sigmas > 2.0 * np.nanmax(hidden)
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_other_views_of_one_microscope_agree(model: CalibrationModel) -> None:

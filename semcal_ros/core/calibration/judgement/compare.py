@@ -35,7 +35,11 @@ from semcal_ros.core.calibration.judgement.thresholds import (
 )
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.camera.uncertainty import make_field_lattice, predict_shape_sigma_px
+from semcal_ros.core.camera.uncertainty import (
+    make_field_lattice,
+    predict_aligned_sigma_px,
+    predict_shape_sigma_px,
+)
 from semcal_ros.core.errors import InvalidValueError
 
 
@@ -55,6 +59,9 @@ class DifferenceAt:
         (n, 2) raw pixels of the first, a lattice over its field, row by row; NaN rows have no difference.
     difference_px, sigma_px
         (n, 2) difference relative to the image centre, px, and (n,) its joint 1-sigma along the worse axis.
+    shape_px, shape_sigma_px
+        (n, 2) what the best shift, turn and scale leave of it, and (n,) its joint 1-sigma: a scale that is known less
+        well than aspect, skew and distortion would hide these.
     """
 
     magnification: float
@@ -64,6 +71,8 @@ class DifferenceAt:
     xy: Array
     difference_px: Array
     sigma_px: Array
+    shape_px: Array
+    shape_sigma_px: Array
 
     @property
     def worst_px(self) -> float:
@@ -77,12 +86,21 @@ class DifferenceAt:
 
     @property
     def field_sigmas(self) -> float:
-        """Largest difference over the field in its joint sigmas."""
+        """Largest difference over the field, or that of the whole shape, in its joint sigmas."""
         length = np.linalg.norm(self.difference_px, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = length / self.sigma_px
         ratio = ratio[np.isfinite(ratio)]
-        return float(ratio.max()) if len(ratio) else _sigmas(self.worst_px)
+        return max(float(ratio.max()), self.shape_sigmas) if len(ratio) else _sigmas(self.worst_px)
+
+    @property
+    def shape_sigmas(self) -> float:
+        """RMS of what shift, turn and scale leave, over that of its joint sigma."""
+        length = np.linalg.norm(self.shape_px, axis=1)
+        known = np.isfinite(length) & np.isfinite(self.shape_sigma_px)
+        square = float(np.sum(length[known] ** 2))
+        variance = float(np.sum(self.shape_sigma_px[known] ** 2))
+        return math.sqrt(square / variance) if variance > 0.0 else 0.0
 
 
 def _sigmas(difference: float) -> float:
@@ -191,9 +209,13 @@ def _compare_at(first: ScanCamera, second: ScanCamera) -> DifferenceAt:
         points = first.sem_from_ideal(ideal[known])
         moved[known] = second.project(points + second.sem_from_ideal(there) - points[:1])
     difference = moved[1:] - xy
-    sigma = np.hypot(
-        predict_shape_sigma_px(first, _finite(ideal[1:])),
-        predict_shape_sigma_px(second, _finite(ideal[1:])),
+    sigma, shape_sigma = (
+        np.where(
+            known[1:],
+            np.hypot(predict(first, _finite(ideal[1:])), predict(second, _finite(ideal[1:]))),
+            np.nan,
+        )
+        for predict in (predict_shape_sigma_px, predict_aligned_sigma_px)
     )
     sizes = [float(np.mean(camera.pixel_size_m)) for camera in (first, second)]
     return DifferenceAt(
@@ -203,8 +225,23 @@ def _compare_at(first: ScanCamera, second: ScanCamera) -> DifferenceAt:
         pixel_size_m=sizes[0],
         xy=xy,
         difference_px=difference,
-        sigma_px=np.where(known[1:], sigma, np.nan),
+        sigma_px=sigma,
+        shape_px=_align(xy, difference),
+        shape_sigma_px=shape_sigma,
     )
+
+
+def _align(xy: Array, difference: Array) -> Array:
+    """Return what the best shift, turn and scale leave of (n, 2) differences at (n, 2) pixels; NaN rows stay."""
+    known = np.all(np.isfinite(difference), axis=1)
+    left = np.full_like(difference, np.nan)
+    x, y = (xy[known] - xy.mean(axis=0)).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    moves = np.stack([np.stack([one, zero, -y, x], 1), np.stack([zero, one, x, y], 1)], 1)
+    columns, values = moves.reshape(-1, 4), difference[known].ravel()
+    found = np.linalg.lstsq(columns, values, rcond=None)[0]
+    left[known] = (values - columns @ found).reshape(-1, 2)
+    return left
 
 
 def _finite(xy: Array) -> Array:
