@@ -174,10 +174,13 @@ def test_a_corrected_frame_on_the_page(
 def test_moves_within_limits(peer: Peer, configuration: Path) -> None:
     with demo(peer, configuration, allow_motion=True, max_tilt=0.5, step_tilt=0.2) as heard:
         assert heard.move(tilt=0.1)["state"] == "done"
-        # Unknown on its way, then where it is.
-        peer.wait_for(lambda: len(heard.joints) >= 3, "the tilted stage")
-        assert list(heard.joints[1].name) == []
-        assert heard.joints[2].position[0] == 0.1
+        # Unknown on its way, then where it is. Only the last state is kept for a reader, so that one of them may be
+        # skipped on a busy computer.
+        peer.wait_for(
+            lambda: heard.joints and list(heard.joints[-1].position[:1]) == [0.1],
+            "the tilted stage",
+        )
+        assert all(list(joint.name) == [] for joint in heard.joints[1:-1])
         for refused, reason in (
             ({"tilt": 0.45}, "at most 0.2 rad"),
             ({"tilt": 0.6}, "soft limits"),
