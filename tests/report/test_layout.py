@@ -151,7 +151,17 @@ def test_the_figure_of_a_difference(high: float) -> None:
     y, x = np.mgrid[0:480:7j, 0:640:9j]
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     at = tuple(
-        DifferenceAt(float(g), 1e-4 * k, 1e-4, 1e-4 / g, xy, 1e-3 * xy * k, np.full(len(xy), 0.02))
+        DifferenceAt(
+            magnification=float(g),
+            scale=1e-4 * k,
+            scale_sigma=1e-4,
+            pixel_size_m=1e-4 / g,
+            xy=xy,
+            difference_px=1e-3 * xy * k,
+            sigma_px=np.full(len(xy), 0.02),
+            shape_px=np.zeros_like(xy),
+            shape_sigma_px=np.full(len(xy), 0.01),
+        )
         for k, g in enumerate(np.geomspace(1000.0, high, 5))
     )
     names = ("calibration_of_the_22nd_of_november_before_service.yaml", "after_service" * 5)
