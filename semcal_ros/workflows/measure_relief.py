@@ -229,11 +229,6 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
         )
     else:
         notes.append("the pictures are rectified by the calibration, which gives the pixel size")
-    if len(frames) == 2:
-        notes.append(
-            "two pictures do not tell a slope of the whole field from a drift within a frame, which is not in the "
-            f"1-sigma: a drift of 1 px over a frame may tilt the relief by {_slope_deg(frames[0], tilts):.2g} degrees"
-        )
     on_progress("measuring heights", 0, None)
     pictures, masks = zip(*(_flatten(frame, model, microscope) for frame in frames), strict=True)
     found = measure_heights(
@@ -249,6 +244,11 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
         ),
         masks=masks,
     )
+    if len(frames) == 2:
+        notes.append(
+            "two pictures do not tell a slope of the whole field from a drift within a frame, which is not in the "
+            f"1-sigma: a drift of 1 px over a frame may tilt the relief by {_slope_deg(frames[0], tilts):.2g} degrees"
+        )
     if axis_rad is None:
         notes.append(
             "hills and dents are told apart by the sense of the tilt axis, which is assumed to be that of the "

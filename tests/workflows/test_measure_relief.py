@@ -16,12 +16,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 from scipy.ndimage import map_coordinates
 
 from benchmarks.thresholds.fleets.reconstruction import AXIS_RAD, RoughSurface, expose
 from semcal_ros.calibration import Calibration
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.workflows.measure_relief import Relief, measure_relief
 from tests.helpers.calibrations import calibrated
 
@@ -66,3 +70,10 @@ def test_a_calibration_takes_the_distortion_out_of_the_heights() -> None:
     assert error_m < 0.5 * untold_m
     assert any("rectified by the calibration" in note for note in flat.notes)
     assert any("do not tell a slope" in note for note in flat.notes)
+
+
+@pytest.mark.parametrize("tilts_rad", [(0.0,), (0.1, 0.1), (0.0, math.nan)])
+def test_tilts_that_cannot_be_are_refused(tilts_rad: tuple[float, ...]) -> None:
+    images = [(np.zeros((64, 64), np.uint8), G)] * 2
+    with pytest.raises(InvalidValueError, match="tilts"):
+        measure_relief(images, tilts_rad=tilts_rad)
