@@ -27,9 +27,8 @@ import numpy as np
 
 from semcal_ros.applications.reconstruction.tilt_series import HeightMap, measure_heights
 from semcal_ros.bridge.images import to_gray
-from semcal_ros.calibration import Calibration
-from semcal_ros.config.config import MicroscopeConfig
 from semcal_ros.core.arrays import AnyImage, Mask
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.rectification.rectifier import Rectifier
 from semcal_ros.core.wording import counted
@@ -218,9 +217,8 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
             "images of different magnifications", expected="images of one magnification"
         )
     tilts = _read_tilts(frames) if tilts_rad is None else tilts_rad
-    camera = camera_for(frames[0], model, microscope)
-    if model is not None:
-        camera = camera.rectified
+    raw = camera_for(frames[0], model, microscope)
+    camera = raw if model is None else raw.rectified
     size = camera.pixel_size_m[0]
     sigma = None if model is None or camera.covariance is None else max(camera.pixel_size_sigma_m)
     if sigma is None:
@@ -230,7 +228,10 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
     else:
         notes.append("the pictures are rectified by the calibration, which gives the pixel size")
     on_progress("measuring heights", 0, None)
-    pictures, masks = zip(*(_flatten(frame, model, microscope) for frame in frames), strict=True)
+    pictures = [to_gray(frame.visible, frame.encoding) for frame in frames]
+    masks = [frame.mask for frame in frames]
+    if model is not None:
+        pictures, masks = _rectify(pictures, masks, raw)
     found = measure_heights(
         pictures,
         tilts,
@@ -263,18 +264,17 @@ def measure_recorded_relief(source: Source, options: ReliefOptions) -> Relief:
     return Relief(found, PixelScale(size, sigma), tuple(notes))
 
 
-def _flatten(
-    frame: RecordedFrame, model: Calibration | None, microscope: MicroscopeConfig
-) -> tuple[AnyImage, Mask | None]:
-    """Return the grey levels of a frame, rectified where there is a calibration, and where they show the specimen."""
-    grey = to_gray(frame.visible, frame.encoding)
-    if model is None:
-        return grey, frame.mask
-    camera, rectifier = camera_for(frame, model, microscope), Rectifier("cubic")
-    shown = np.ones(grey.shape, np.float32) if frame.mask is None else frame.mask.astype(np.float32)
-    # What was not scanned is zero, too.
-    scanned = np.asarray(rectifier.rectify(shown, camera), dtype=np.float32)
-    return rectifier.rectify(grey, camera), scanned > 0.99
+def _rectify(
+    pictures: Sequence[AnyImage], masks: Sequence[Mask | None], camera: ScanCamera
+) -> tuple[list[AnyImage], list[Mask | None]]:
+    """Return rectified pictures of one camera, and their masks, which leave out what was not scanned as well."""
+    rectifier = Rectifier("cubic")
+    shown: list[Mask | None] = []
+    for picture, mask in zip(pictures, masks, strict=True):
+        part = np.ones(picture.shape) if mask is None else mask
+        rectified = rectifier.rectify(part.astype(np.float32), camera)
+        shown.append(np.asarray(rectified, dtype=np.float32) > 0.99)
+    return [rectifier.rectify(picture, camera) for picture in pictures], shown
 
 
 def _slope_deg(frame: RecordedFrame, tilts_rad: Sequence[float]) -> float:

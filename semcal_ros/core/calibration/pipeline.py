@@ -177,8 +177,7 @@ def calibrate_views(
         contradiction = _find_contradicted_stage(views, setup)
         if not contradiction:
             joint, setup, told = _fit_without_window_bias(joint, setup, options, on_stage)
-            notes += told
-            notes += [*_find_turned_axis(views, setup, joint), *lines]
+            notes += [*told, *_find_turned_axis(views, setup, joint), *lines]
             return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
     except CalibrationError as error:
         if not is_optional:
@@ -197,8 +196,7 @@ def calibrate_views(
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
         joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
         joint, setup, told = _fit_without_window_bias(joint, setup, options, on_stage)
-        notes += told
-        notes += [*contradiction, *_find_turned_axis(views, setup, joint), *lines]
+        notes += [*told, *contradiction, *_find_turned_axis(views, setup, joint), *lines]
         return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
     except CalibrationError as error:
         # Without the stage it is no better: that was not what is wrong.

@@ -373,7 +373,7 @@ BIAS_NEGLIGIBLE = TABLE.derived(
 )
 WINDOW_BIAS_SETTLED = TABLE.derived(
     "WINDOW_BIAS_SETTLED", 0.3, "sigmas",
-    "By which corners move at most from one fit to the next: 0.1 more of the chi-square of a corner, which is 2.",
+    "Bias that may be left in a corner without another fit: 0.1 more of its chi-square, which is 2.",
 )
 WINDOW_BIAS_LEFT = TABLE.defined(
     "WINDOW_BIAS_LEFT", 3.0, "sigmas",
@@ -381,5 +381,5 @@ WINDOW_BIAS_LEFT = TABLE.defined(
 )
 WINDOW_BIAS_ROUNDS = TABLE.cost(
     "WINDOW_BIAS_ROUNDS", 4, "fits",
-    "Until the corners no longer move; the largest moves by 12, 9, 0.9 and 0.07 sigmas where the beam settles by 3 px.",
+    "Until no bias is left; the corners moved by up to 12, 9, 0.9 and 0.07 sigmas where the beam settles by 3 px.",
 )

@@ -211,7 +211,7 @@ class ScanCamera:
 
     @property
     def all_parameters(self) -> Array:
-        """All parameters, also zeros, in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
+        """(k,) parameters, with all zeros, in the order of :data:`~semcal_ros.core.camera.projection.ALL_NAMES`."""
         return np.array([getattr(self, name) for name in ALL_NAMES], dtype=np.float64)
 
     @property

@@ -131,9 +131,14 @@ _RATES = -1.0 / np.array(SETTLING_TIMES)
 _DEGREE = LEGENDRE_POWERS.shape[1] - 1
 
 
+def _whole_decays(u: Array) -> Array:
+    """Return the decays with their straight lines, (k, n)."""
+    return np.asarray(np.exp(_RATES[:, None] * (1.0 + u)))
+
+
 def _decays(u: Array) -> tuple[Array, Array]:
     """Return the decays without their straight lines, (k, n), and their slopes."""
-    values = np.exp(_RATES[:, None] * (1.0 + u))
+    values = _whole_decays(u)
     slopes = _RATES[:, None] * values
     return (
         values - _LINES[:, :1] - _LINES[:, 1:] * u,
@@ -196,7 +201,7 @@ def deflection_stretch(xy: Array, amplitudes: Array, raster: Raster) -> Array:
 def settling_decay(x: Array, amplitudes: Array, raster: Raster) -> Array:
     """Return the sum of the decays (n,), with nothing taken out, at raw columns ``x`` (n,), in half image widths."""
     u = np.clip((x - raster.middle_px[0]) / raster.norm_px, -SCAN_END, SCAN_END)
-    return np.asarray(np.exp(_RATES * (1.0 + u)[:, None]) @ amplitudes[SETTLING])
+    return np.asarray(amplitudes[SETTLING] @ _whole_decays(u))
 
 
 def raw_from_deflection(deflection: Array, amplitudes: Array, raster: Raster) -> Array:

@@ -80,6 +80,13 @@ def predict_shape_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     return _compute_larger_sigma(jacobian[1:] - moved[1:] @ shift, covariance)
 
 
+def make_similarity_moves(xy: Array) -> Array:
+    """Return what shifts along x and y, a turn and a scale about their middle do to (n, 2) points: (n, 2, 4)."""
+    x, y = (xy - xy.mean(axis=0)).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    return np.stack([np.stack([one, zero, -y, x], 1), np.stack([zero, one, x, y], 1)], 1)
+
+
 def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     """Predict as :func:`predict_shape_sigma_px`, after the best shift, turn and scale.
 
@@ -98,10 +105,7 @@ def predict_aligned_sigma_px(camera: ScanCamera, xy: Array) -> Array:
     known = np.all(np.isfinite(jacobian), axis=(1, 2))
     if not np.any(known):
         return np.full(len(xy), np.nan)
-    x, y = (points[known, :2] - points[known, :2].mean(axis=0)).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    moves = np.stack([np.stack([one, zero, -y, x], 1), np.stack([zero, one, x, y], 1)], 1)
-    columns = (moved[known][:, :, :2] @ moves).reshape(-1, 4)
+    columns = (moved[known][:, :, :2] @ make_similarity_moves(points[known, :2])).reshape(-1, 4)
     basis = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
     rows = jacobian[known].reshape(-1, jacobian.shape[2])
     left = (rows - basis @ (basis.T @ rows)).reshape(-1, 2, jacobian.shape[2])

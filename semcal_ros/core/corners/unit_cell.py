@@ -341,7 +341,7 @@ def _fit_block(
     moved, levels = np.zeros((count, 2)), np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (count, 1))
     total = np.maximum(windows.valid.sum(axis=1), 1.0)
     levels[:, 1] = (windows.value * windows.valid).sum(axis=1) / total
-    for _ in range(iterations):
+    for left in range(iterations - 1, -1, -1):
         mean, along_i, along_j, laplacian = _look_up(
             tables, *_lattice_coordinates(windows, maps, moved)
         )
@@ -358,7 +358,8 @@ def _fit_block(
             normal[:, axis, axis] += 1.0 / spacing[:, 0] ** 2
             right[:, axis] -= moved[:, axis] / spacing[:, 0] ** 2
         covariance = np.linalg.inv(normal).astype(np.float64, copy=False)
-        sides = displaced_sides(windows, moved[:, 0], jacobian, weight)
+        if not left:
+            sides = displaced_sides(windows, moved[:, 0], jacobian, weight)
         step = (covariance @ right[:, :, None])[:, :, 0]
         moved = moved + np.clip(step[:, :2], -limit, limit)
         levels = levels + step[:, 2:]

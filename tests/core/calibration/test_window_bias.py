@@ -148,10 +148,15 @@ def view_of(found: LatticeDetection) -> GridView:
     return views[0]
 
 
-def test_without_settling_or_without_what_a_fit_says_nothing_is_taken_out() -> None:
-    found = find_lattice(draw("chess", 30.0, 0.3, np.zeros(len(SCAN_NAMES))))
+def see_undistorted(pattern: str) -> GridView:
+    """A view of a grid by a beam that goes where it should."""
+    found = find_lattice(draw(pattern, 30.0, 0.3, np.zeros(len(SCAN_NAMES))), pattern=pattern)
     assert isinstance(found, LatticeDetection)
-    view = view_of(found)
+    return view_of(found)
+
+
+def test_without_settling_or_without_what_a_fit_says_nothing_is_taken_out() -> None:
+    view = see_undistorted("chess")
     assert not np.any(find_window_bias(view, amplitudes_of("coil_y3", 2.0), RASTER))
     amplitudes = amplitudes_of("settling_3", 3.0)
     assert np.any(find_window_bias(view, amplitudes, RASTER))
@@ -165,9 +170,7 @@ def test_without_settling_or_without_what_a_fit_says_nothing_is_taken_out() -> N
 
 
 def test_a_decay_that_was_fitted_to_biased_corners_tells_the_bias_in_one_step() -> None:
-    found = find_lattice(draw("dots", 30.0, 0.3, np.zeros(len(SCAN_NAMES))), pattern="dots")
-    assert isinstance(found, LatticeDetection)
-    view = view_of(found)
+    view = see_undistorted("dots")
     true = amplitudes_of("settling_3", 1.0)
     bias = find_window_bias(view, true, RASTER)
     # Of one corner: its decay is fitted a times too large.
@@ -182,9 +185,7 @@ def test_a_decay_that_was_fitted_to_biased_corners_tells_the_bias_in_one_step() 
 
 
 def test_what_the_coils_do_is_taken_out_at_once() -> None:
-    found = find_lattice(draw("dots", 30.0, 0.3, np.zeros(len(SCAN_NAMES))), pattern="dots")
-    assert isinstance(found, LatticeDetection)
-    view = view_of(found)
+    view = see_undistorted("dots")
     coils = amplitudes_of("coil_x7", 1.0)
     bias = find_window_bias(view, coils, RASTER)
     assert np.max(np.abs(bias)) > np.min(view.sigma_px)
@@ -193,9 +194,7 @@ def test_what_the_coils_do_is_taken_out_at_once() -> None:
 
 
 def test_odd_views_have_no_bias() -> None:
-    found = find_lattice(draw("chess", 30.0, 0.3, np.zeros(len(SCAN_NAMES))))
-    assert isinstance(found, LatticeDetection)
-    view, settling = view_of(found), amplitudes_of("settling_3", 3.0)
+    view, settling = see_undistorted("chess"), amplitudes_of("settling_3", 3.0)
     # Of a part of the corners it would be that of another lattice.
     assert view.chosen(np.arange(0, len(view.image_xy), 3)).scan_response is None
     none = np.zeros((0, 2))

@@ -37,6 +37,7 @@ from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.uncertainty import (
     make_field_lattice,
+    make_similarity_moves,
     predict_aligned_sigma_px,
     predict_shape_sigma_px,
 )
@@ -235,10 +236,7 @@ def _align(xy: Array, difference: Array) -> Array:
     """Return what the best shift, turn and scale leave of (n, 2) differences at (n, 2) pixels; NaN rows stay."""
     known = np.all(np.isfinite(difference), axis=1)
     left = np.full_like(difference, np.nan)
-    x, y = (xy[known] - xy.mean(axis=0)).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    moves = np.stack([np.stack([one, zero, -y, x], 1), np.stack([zero, one, x, y], 1)], 1)
-    columns, values = moves.reshape(-1, 4), difference[known].ravel()
+    columns, values = make_similarity_moves(xy[known]).reshape(-1, 4), difference[known].ravel()
     found = np.linalg.lstsq(columns, values, rcond=None)[0]
     left[known] = (values - columns @ found).reshape(-1, 2)
     return left
