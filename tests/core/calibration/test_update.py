@@ -24,6 +24,7 @@ from semcal_ros.core.calibration.judgement.update import CalibrationUpdate, upda
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError, InvalidValueError
 from tests.core.calibration.test_check import (
     AXIS,
@@ -76,6 +77,44 @@ def test_a_few_views_are_enough_for_what_all_magnifications_share(
         assert abs(after.ex - true.ex) < 3.0
     log = done.model.statistics["updates"]
     assert [entry["views"] for entry in log] == [9]
+
+
+def with_distortion_times(factor: float) -> Camera:
+    def camera(g: float) -> ScanCamera:
+        own = SEM.camera_at(g)
+        return replace(own, xi_r=factor * own.xi_r, xi_t=factor * own.xi_t)
+
+    return camera
+
+
+@pytest.mark.parametrize("magnifications", [(300.0,), (2000.0,), CHECKED])
+@pytest.mark.parametrize(
+    "camera",
+    [with_distortion_times(2.0), with_distortion_times(0.5), changed(xi_r=0.004)],
+    ids=["doubled", "halved", "more by the same everywhere"],
+)
+def test_a_distortion_may_have_changed_in_proportion_or_by_the_same_everywhere(
+    calibrated: CalibrationResult, camera: Camera, magnifications: tuple[float, ...]
+) -> None:
+    """It is a third as large at 5000x as at 200x: views at one magnification do not tell what became of it at another.
+
+    Where that was taken for an equal change, xi_r was off by up to 67 stated sigmas.
+    """
+    done = update_calibration(
+        calibrated.model,
+        simulated(camera, magnifications, 70),
+        image_size=SEM.image_size,
+        axis=AXIS,
+    )
+    assert [change.name for change in done.check.changes] == ["distortion"]
+    for g in (200.0, *EVERYWHERE):
+        ours, true = done.model.at(g), camera(g)
+        error = np.array([ours.xi_r - true.xi_r, ours.xi_t - true.xi_t])
+        # Of some ninety that are not independent, one is beyond 3.5 by chance in twenty.
+        assert np.all(np.abs(error) < 3.5 * np.sqrt(np.diag(ours.covariance)[[6, 7]]))
+    # Where the views are, it is as certain as they make it.
+    seen = done.model.at(magnifications[0])
+    assert np.sqrt(seen.covariance[6, 6]) < 0.1 * camera(magnifications[0]).xi_r
 
 
 @pytest.mark.long

@@ -69,6 +69,8 @@ from semcal_ros.core.errors import CalibrationError
 #: Parameters that may have changed since the calibration, by the same amount at all magnifications; that of the
 #: scale is relative.
 CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
+#: Those of which a part may have changed in proportion to them, as the distortion of a lens that got stronger does.
+GAINS = ("xi_r", "xi_t")
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ class Revision:
         The new views, with the residual field of the calibration taken out.
     problem, result
         The adjustment. Its unknowns are a 1, the principal components of the calibration's covariance in sigmas,
-        the height of the grid and the size of its squares, :data:`CHANGING`, and what all views share.
+        the height of the grid and the size of its squares, :data:`CHANGING`, the relative changes of :data:`GAINS`,
+        and what all views share.
     covariance
         (K, K) of the unknowns, with what the jitter of lines adds.
     misfit
@@ -105,8 +108,14 @@ class Revision:
     @property
     def changes(self) -> slice:
         """Where :data:`CHANGING` are among the unknowns."""
-        first = len(self.result.state.theta) - len(self.problem.shared) - len(CHANGING)
+        first = self.gains.start - len(CHANGING)
         return slice(first, first + len(CHANGING))
+
+    @property
+    def gains(self) -> slice:
+        """Where the relative changes of :data:`GAINS` are among the unknowns."""
+        first = len(self.result.state.theta) - len(self.problem.shared) - len(GAINS)
+        return slice(first, first + len(GAINS))
 
 
 def free_sigmas(setup: Setup) -> dict[str, float]:
@@ -228,7 +237,12 @@ def _designs_of_size(
     return np.stack(out)
 
 
-def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -> Revision:
+def revise(
+    model: CalibrationModel,
+    setup: Setup,
+    sigmas: Mapping[str, float],
+    gains: Mapping[str, float] | None = None,
+) -> Revision:
     """Adjust a calibration, and all that :func:`make_setup` leaves open, to views.
 
     Parameters
@@ -239,6 +253,8 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         The views, from :func:`make_setup`.
     sigmas
         Prior 1-sigma of each of :data:`CHANGING`.
+    gains
+        That of the relative changes of :data:`GAINS`; None: they change by the same amount everywhere.
 
     Raises
     ------
@@ -251,21 +267,25 @@ def revise(model: CalibrationModel, setup: Setup, sigmas: Mapping[str, float]) -
         height_sigma_m=_spread(model, setup).height_sigma_m,
     )
     spread = _spread(model, setup)
-    problem = _build(model, setup, spread, sigmas)
+    every = [
+        *(sigmas[name] for name in CHANGING),
+        *((gains or {}).get(name, 0.0) for name in GAINS),
+    ]
+    problem = _build(model, setup, spread, every)
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
     result = adjust(problem, State(theta, poses.rotations, poses.translations_m))
     for _ in range(DRIFT_UPDATES if problem.effects is not None else 0):
         own = update_components(setup, problem, result)
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
-        problem = _build(model, setup, spread, sigmas)
+        problem = _build(model, setup, spread, every)
         result = refine(problem, result.state)
     misfit = float(np.sqrt(residual_variance(problem, result)))
     freedom = problem.layout.of_view.size * len(setup.views) + len(theta)
     excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
     if excess > 0.0:
         setup = replace(setup, views=tuple(add_excess_noise(setup.views, excess)))
-        problem = _build(model, setup, spread, sigmas)
+        problem = _build(model, setup, spread, every)
         result = refine(problem, result.state)
     jitter = jitter_covariance(problem, result, estimate_jitter(problem, result))
     return Revision(model, setup, problem, result, result.covariance + jitter, misfit)
@@ -275,15 +295,19 @@ def _build(
     model: CalibrationModel,
     setup: Setup,
     spread: VarianceComponents,
-    sigmas: Mapping[str, float],
+    sigmas: Sequence[float],
 ) -> Problem:
-    """Make the adjustment: the camera as calibrated, then :data:`CHANGING`, then what all views share."""
+    """Make the adjustment: the camera as calibrated, then :data:`CHANGING` and :data:`GAINS`, whose prior ``sigmas``
+    are given, then what all views share.
+    """
     problem = build_problem(setup, model.functions, setup.views, spread)
     designs, sigma = _camera_designs(model, setup)
-    changes = np.zeros((*designs.shape[:2], len(CHANGING)))
-    for column, name in enumerate(CHANGING):
-        changes[:, ALL_FUNCTIONS.index(name), column] = designs[:, 0, 0] if name == "scale" else 1.0
-    free = [max(sigmas[name], HELD_SIGMA) for name in CHANGING]
+    changes = np.zeros((*designs.shape[:2], len(sigmas)))
+    for column, name in enumerate((*CHANGING, *GAINS)):
+        row = ALL_FUNCTIONS.index(name)
+        is_relative = name == "scale" or column >= len(CHANGING)
+        changes[:, row, column] = designs[:, row, 0] if is_relative else 1.0
+    free = np.maximum(sigmas, HELD_SIGMA)
     cameras = np.concatenate([designs, changes], axis=2)
     mean = np.append(1.0, np.zeros(cameras.shape[2] - 1))
     shared = len(problem.shared)

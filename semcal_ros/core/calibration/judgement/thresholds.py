@@ -315,6 +315,10 @@ DEFAULT_AGEING = TABLE.measured(
     "change by 0.1 % at most.",
     command=TRIED,
 )
+GAIN_MAX = TABLE.stated(
+    "GAIN_MAX", 1.0, "of the distortion",
+    "Prior 1-sigma, at most, of a change in proportion to it: it may have doubled, or gone.",
+)
 SHAPE_PART = TABLE.measured(
     "SHAPE_PART", 0.2, "of the ageing",
     "By which the shape changes: it is made by ratios of what makes the scale. 1.5 times as large or as small, the "

@@ -15,7 +15,8 @@
 """Renew a calibration with a few views of the grid.
 
 The covariance of the calibration is the prior, and the changes that a check proves are free
-(:mod:`~semcal_ros.core.calibration.judgement.check`). What has not changed by that test may have aged a little: its
+(:mod:`~semcal_ros.core.calibration.judgement.check`). A distortion may have changed by the same amount at all
+magnifications, or in proportion to what it was. What has not changed by that test may have aged a little: its
 change has a prior of the ageing that the user states. The result is the posterior of a linear Gaussian model
 (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 2), so that a second update with
 other views continues from it.
@@ -29,6 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
+from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.judgement.check import (
     CHANGES,
     CalibrationCheck,
@@ -37,6 +39,7 @@ from semcal_ros.core.calibration.judgement.check import (
 )
 from semcal_ros.core.calibration.judgement.revision import (
     CHANGING,
+    GAINS,
     Revision,
     free_sigmas,
     make_setup,
@@ -45,6 +48,7 @@ from semcal_ros.core.calibration.judgement.revision import (
 from semcal_ros.core.calibration.judgement.thresholds import (
     AGEING_MAX,
     DEFAULT_AGEING,
+    GAIN_MAX,
     SHAPE_PART,
     UPDATE_MISFIT,
 )
@@ -132,7 +136,7 @@ def update_calibration(
     proven = {name for change in check.changes for name in CHANGES[change.name]}
     aged = ageing_sigmas(ageing, image_size[0])
     sigmas = {name: free[name] if name in proven else aged[name] for name in CHANGING}
-    revision = revise(model, setup, sigmas)
+    revision = revise(model, setup, sigmas, _gain_sigmas(model, setup, check))
     rms_px = float(np.sqrt(np.mean(np.sum(revision.result.residuals_px**2, axis=1))))
     renewed = _apply(revision)
     log = model.statistics.get("updates", [])
@@ -207,6 +211,25 @@ def change_directions(model: CalibrationModel, image_width: int) -> Array:
     return changes
 
 
+def _gain_sigmas(
+    model: CalibrationModel, setup: Setup, check: CalibrationCheck
+) -> dict[str, float]:
+    """Return the prior 1-sigma of the relative changes of :data:`GAINS`: so large that they could be the whole change
+    that was proven, where the views are.
+
+    Whether the distortion has changed by the same amount at all magnifications or in proportion, views at one of them
+    do not tell.
+    """
+    sigmas = {}
+    for change in check.changes:
+        for name, value in zip(CHANGES[change.name], change.values, strict=True):
+            if name in GAINS:
+                own = [model.functions[name](float(g)) for g in setup.magnifications]
+                usual = float(np.sqrt(np.mean(np.square(own))))
+                sigmas[name] = min(abs(value) / max(usual, np.finfo(np.float64).tiny), GAIN_MAX)
+    return sigmas
+
+
 def _constant(function: ContinuousFunction) -> Array:
     """Coefficients with which a function is 1 at all magnifications."""
     grid = np.union1d(np.geomspace(*function.g_range, 64), function.breaks)
@@ -223,8 +246,12 @@ def _apply(revision: Revision) -> CalibrationModel:
     model, theta = revision.model, revision.result.state.theta
     root = model.principal_components
     changes = change_directions(model, revision.setup.image_size[0])
-    steps, size = np.concatenate([root, changes], axis=1), len(root)
-    index = np.r_[revision.components, revision.changes]
+    columns = columns_of(model.functions)
+    gains = np.zeros((len(root), len(GAINS)))
+    for column, name in enumerate(GAINS):
+        gains[columns[name], column] = model.functions[name].coefficients
+    steps, size = np.concatenate([root, changes, gains], axis=1), len(root)
+    index = np.r_[revision.components, revision.changes, revision.gains]
     values = model.coefficients + steps @ theta[index]
     own = revision.covariance[np.ix_(index, index)]
     covariance = model.covariance.copy()
