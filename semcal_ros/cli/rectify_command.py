@@ -50,16 +50,7 @@ def command(recording: RecordedFiles, config: MicroscopeConfig, options: Rectify
             recording, replace(options, config=config, on_progress=on_progress)
         )
     echo_notes(done.notes)
-    if done.extrapolated:
-        click.echo(
-            f"warning: {counted(done.extrapolated, 'frame is', 'frames are')} outside the calibrated range",
-            err=True,
-        )
     echo_states(done.states)
-    if options.drift and done.frame_count > 1 and not done.followed:
-        click.echo(
-            f"warning: none of {counted(done.frame_count, 'frame')} was tracked: the drift is not known, "
-            "and was left in",
-            err=True,
-        )
+    for warning in done.warnings:
+        click.echo(f"warning: {warning}", err=True)
     click.echo(f"{counted(done.frame_count, 'frame')}: {output}")

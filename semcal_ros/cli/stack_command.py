@@ -39,9 +39,6 @@ from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.files.video import VIDEO_CODECS
 from semcal_ros.workflows.stack import StackOptions, StackResult, stack_recording
 
-# 1-sigma of the drift beyond which the average is visibly blurred, px.
-_UNKNOWN_PX = 1.0
-
 
 @click.command("stack")
 @recording_input
@@ -70,16 +67,14 @@ def command(recording: RecordedFiles, config: MicroscopeConfig, options: StackOp
         result = stack_recording(
             recording, replace(options, config=config, on_progress=on_progress)
         )
-    _echo_result(result, calibrated=options.calibration is not None)
+    _echo_result(result)
     echo_paths(dict(zip(("average", "standard error", "video"), written.values(), strict=True)))
 
 
-def _echo_result(result: StackResult, *, calibrated: bool) -> None:
+def _echo_result(result: StackResult) -> None:
     echo_notes(result.notes)
-    if not calibrated:
+    if not result.is_calibrated:
         echo_nominal_unit(result.config.display_width_m, "the pixel size is the nominal one")
-    elif not result.camera.in_range:
-        click.echo("warning: the frames are outside the calibrated range", err=True)
     if result.other_kind:
         echo_notes([f"{counted(result.other_kind, 'frame')} of another size or encoding left out"])
     echo_states(result.states)
@@ -90,17 +85,9 @@ def _echo_result(result: StackResult, *, calibrated: bool) -> None:
     )
     if result.scan_drift is not None:
         _echo_scan_drift(result.scan_drift, result.camera.pixel_size_m[0])
-    left_out = len(result.used) - result.image.frames
-    if 2 * result.image.frames <= len(result.used):
-        # Half of the frames: more of the recording is missing than is in the average.
-        reasons = "; ".join(
-            f"{counted(count, 'frame')}: {kind}" for kind, count in result.reasons.items()
-        )
-        click.echo(
-            f"warning: {left_out} of {counted(len(result.used), 'frame')} left out: {reasons}",
-            err=True,
-        )
-    elif result.lost:
+    for warning in result.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    if result.lost and 2 * result.image.frames > len(result.used):
         echo_notes([f"tracking was lost: {counted(result.lost, 'frame')} after that left out"])
     if result.scan_drift is not None:
         # Of two values each, the median of the scatter would be a third too small.
@@ -121,9 +108,4 @@ def _echo_scan_drift(drift: ScanPairDrift, pixel_size_m: float) -> None:
             f"scan {number + 1}: drift within {way_px[0]:.2f} px in x and {way_px[1]:.2f} px in y"
             f" ({x_nm:.3g} and {y_nm:.3g} nm) from {lines[0]:.0%} to {lines[-1]:.0%} of its lines;"
             f" 1-sigma {float(np.median(sigma)):.2g} px in the median, {float(sigma.max()):.2g} px at most"
-        )
-    if float(drift.sigma_px.max()) > _UNKNOWN_PX:
-        click.echo(
-            "warning: parts of the scans have too little structure to tell their drift; look at the average there",
-            err=True,
         )

@@ -136,6 +136,19 @@ class RectifiedRecording:
         """The images of :attr:`frames`."""
         return tuple(frame.image for frame in self.frames)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes the result doubtful, as sentences."""
+        out = []
+        if self.extrapolated:
+            frames = counted(self.extrapolated, "frame is", "frames are")
+            out.append(f"{frames} outside the calibrated range")
+        if self.states and self.frame_count > 1 and not self.followed:
+            out.append(
+                f"none of {counted(self.frame_count, 'frame')} was tracked: the drift is not known, and was left in"
+            )
+        return tuple(out)
+
 
 @dataclass(frozen=True)
 class RectifyOptions:

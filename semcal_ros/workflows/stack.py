@@ -87,6 +87,8 @@ _SPARSE = 4
 _FRAMES_PER_PART = 20
 # Turned scans: each is compared with all of the other kind, and all are held in memory.
 _MOST_SCANS = 12
+# 1-sigma of the drift beyond which the average of scans is visibly blurred, px.
+_UNKNOWN_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,6 +336,8 @@ class StackResult:
         Notes for the user.
     scan_drift
         Drift during each of the scans, where they were turned against each other.
+    is_calibrated
+        Whether there is a calibration.
     """
 
     image: StackedImage
@@ -347,6 +351,7 @@ class StackResult:
     config: MicroscopeConfig
     notes: tuple[str, ...]
     scan_drift: ScanPairDrift | None = None
+    is_calibrated: bool = False
 
     @property
     def lost(self) -> int:
@@ -364,6 +369,25 @@ class StackResult:
             if not used
         )
         return dict(left_out.most_common())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes the average doubtful, as sentences."""
+        out = []
+        if self.is_calibrated and not self.camera.in_range:
+            out.append("the frames are outside the calibrated range")
+        left_out = len(self.used) - self.image.frames
+        if 2 * self.image.frames <= len(self.used):
+            # Half of the frames: more of the recording is missing than is in the average.
+            reasons = "; ".join(
+                f"{counted(count, 'frame')}: {kind}" for kind, count in self.reasons.items()
+            )
+            out.append(f"{left_out} of {counted(len(self.used), 'frame')} left out: {reasons}")
+        if self.scan_drift is not None and float(self.scan_drift.sigma_px.max()) > _UNKNOWN_PX:
+            out.append(
+                "parts of the scans have too little structure to tell their drift; look at the average there"
+            )
+        return tuple(out)
 
     @property
     def typical_error(self) -> float | None:
@@ -572,6 +596,7 @@ def stack_recording(source: Source, options: StackOptions) -> StackResult:
                 selection.config,
                 opened.notes,
                 scan_drift,
+                is_calibrated=model is not None,
             )
             return _save(result, options)
         summed = Stack(selection.size, options.interpolation)
@@ -611,6 +636,7 @@ def stack_recording(source: Source, options: StackOptions) -> StackResult:
         selection.other_kind,
         selection.config,
         notes,
+        is_calibrated=model is not None,
     )
     return _save(result, options)
 

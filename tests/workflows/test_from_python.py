@@ -141,7 +141,7 @@ def test_an_average_says_what_is_in_it(frames, tmp_path):
     assert result.used.tolist() == [True, True, True, False, True, True]
     assert len(result.stamps_ns) == COUNT + 1 and result.other_kind == 1
     assert result.image.frames == COUNT
-    assert result.dtype == np.uint8 and result.lost == 0
+    assert result.dtype == np.uint8 and result.lost == 0 and result.warnings == ()
     assert result.typical_error == pytest.approx(np.nanmedian(result.image.standard_error))
     result.save(tmp_path / "m.tif")
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "m.tif"), result.image.mean)
@@ -238,6 +238,27 @@ def test_rectified_frames_in_memory_are_those_of_the_bag(frames, tmp_path):
         assert {topic.name for topic in bag.topics} >= {"/a/image_rect", "/a/camera_info"}
         images = [frame.image for frame in bag.frames()]
     np.testing.assert_array_equal(images, done.images)
+
+
+def test_what_makes_a_result_doubtful_is_said_in_python_too(frames):
+    calibration = make_calibration()
+    done = rectify(frames, calibration=calibration, config="virtual_sem")
+    assert done.warnings == (f"{COUNT} frames are outside the calibrated range",)
+    result = stack(frames, calibration=calibration, drift=False)
+    assert result.warnings == ("the frames are outside the calibrated range",)
+    # Frames that have nothing in common with each other.
+    noise = np.random.default_rng(0).integers(0, 255, (5, SIZE, SIZE), dtype=np.uint8)
+    others = [(image, 2000.0, 1.0 * k) for k, image in enumerate(noise)]
+    (warning,) = rectify(others, calibration=calibration).warnings
+    assert warning == "none of 5 frames was tracked: the drift is not known, and was left in"
+    inside = [(image, 2000.0, time) for image, _, time in frames]
+    (warning,) = stack([*inside[:2], *((i, g, 9.0 + t) for i, g, t in others)]).warnings
+    assert (
+        warning
+        == "5 of 7 frames left out: 5 frames: no shift stands out: featureless, or another place"
+    )
+    assert rectify(inside, calibration=calibration).warnings == ()
+    assert stack(inside, calibration=calibration, drift=False).warnings == ()
 
 
 def test_each_rectified_frame_in_a_bag_has_its_projection(frames, tmp_path):
