@@ -168,10 +168,15 @@ def _format_matrix(name: str, values: Any) -> str:
 
 
 def _echo_terms(described: dict[str, Any], camera: ScanCamera) -> None:
-    """Print a line for each kind of distortion beside the radial one and that along one diagonal."""
+    """Print a line for each further term of the lens, and each other kind of distortion."""
     if not has_terms(camera):
         return
     value, sigma, sizes = (described[k] for k in ("parameters", "parameter_sigma", "terms_px"))
+    if value["xi_r4"]:
+        click.echo(
+            f"xi_r4        {value['xi_r4']:.6g} +- {sigma['xi_r4']:.2g} "
+            f"(all radial {sizes['radial']:.2f} px at most)"
+        )
     for name in ("xi_u", "xi_v", "xi_w"):
         if value[name]:
             click.echo(

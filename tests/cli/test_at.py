@@ -133,6 +133,7 @@ def test_each_kind_of_distortion_has_a_line(
 ) -> None:
     path = tmp_path / "cal.yaml"
     terms = {
+        "xi_r4": -0.003,
         "xi_u": 0.004,
         "xi_w": 0.002,
         "xi_s": -0.01,
@@ -144,19 +145,20 @@ def test_each_kind_of_distortion_has_a_line(
     assert run("at", path, 2000) == 0
     told = _lines_of_distortion(capsys.readouterr().out)
     first = [line.split()[0] for line in told]
-    assert first == ["xi_u", "xi_w", "spiral", "coils", "settling", "field"]
-    assert told[0].startswith("xi_u         0.004 +- 0.0001 (all decentring ")
-    assert told[2].startswith("spiral       -0.01 +- 0.0001 (")
+    assert first == ["xi_r4", "xi_u", "xi_w", "spiral", "coils", "settling", "field"]
+    assert told[0].startswith("xi_r4        -0.003 +- 0.0001 (all radial ")
+    assert told[1].startswith("xi_u         0.004 +- 0.0001 (all decentring ")
+    assert told[3].startswith("spiral       -0.01 +- 0.0001 (")
     # P2 is 0.97 in the first column of 96, P3 0.94 in the first row.
-    assert told[3] == "coils        0.93 px at most along x, 0.45 px along y"
-    assert told[5] == "field        0.25 px at most, of the residual field"
+    assert told[4] == "coils        0.93 px at most along x, 0.45 px along y"
+    assert told[6] == "field        0.25 px at most, of the residual field"
     assert run("at", path, 2000, "--json") == 0
     sizes = json.loads(capsys.readouterr().out)["terms_px"]
     kinds = ["radial", "decentring", "spiral", "coils", "settling", "residual field"]
     assert list(sizes) == kinds
     assert sizes["residual field"] == pytest.approx(0.25)
-    assert f"({sizes['spiral']:.2f} px at most)" in told[2]
-    assert told[4] == f"settling     {sizes['settling']:.2f} px at most along x"
+    assert f"({sizes['spiral']:.2f} px at most)" in told[3]
+    assert told[5] == f"settling     {sizes['settling']:.2f} px at most along x"
 
 
 def test_kinds_that_are_not_there_have_no_line(

@@ -25,8 +25,9 @@ meets them, so that an error in one of the two shows. A microscope depends on no
     settling       x += B exp(-column / L) along the lines: column of the picture, or of where the beam should be
 
 These are the forms that the calibration knows. Those of the other physics are not all: the lens is displaced in some
-direction d (Brown 1966: d r2 + 2 q (q . d)), its radial distortion is tan(b r) / (b r) or atan(b r) / (b r), and the
-amplifiers of the coils saturate (a tanh curve, as large).
+direction d (Brown 1966: d r2 + 2 q (q . d)), its radial distortion is tan(b r) / (b r) or atan(b r) / (b r), and in
+half of them has a part of the fifth order, h r4 q, that falls as the square of the third; and the amplifiers of the
+coils saturate (a tanh curve, as large).
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ class Microscope:
     """A microscope, its stage, and how a recording was made with it.
 
     Lengths in m and px, angles in rad. ``coil_px`` is along columns and rows; ``settles_late`` says that the settling
-    is a function of the column of the picture, which is the time since the line began. The last three are of the other
-    physics: in which direction the lens is displaced, whether the radial distortion is that of an angle, and how far
-    into saturation the amplifiers go.
+    is a function of the column of the picture, which is the time since the line began. The last four are of the other
+    physics: in which direction the lens is displaced, whether the radial distortion is that of an angle, how far into
+    saturation the amplifiers go, and the radial distortion of the fifth order.
     """
 
     seed: int
@@ -104,6 +105,7 @@ class Microscope:
     displaced_rad: float | None = None
     by_angle: bool = False
     saturation: float = 0.0
+    fifth: float = 0.0
 
     @property
     def size(self) -> Array:
@@ -151,7 +153,8 @@ class Microscope:
         k = self.radial * np.exp(-g / self.radial_decay)
         t = self.decentring * np.exp(-g / self.decentring_decay)
         c = self.spiral * np.exp(-g / self.spiral_decay)
-        lens = q * self._radial(k, r2)
+        h = self.fifth * np.exp(-2.0 * g / self.radial_decay)
+        lens = q * (self._radial(k, r2) + h * r2 * r2)
         if self.displaced_rad is None:
             lens = lens + t * (r2 + 2.0 * q * q)
         else:
@@ -248,6 +251,7 @@ def draw_microscope(seed: int, index: int, *, other_physics: bool = False) -> Mi
         displaced_rad=draws.between(-np.pi, np.pi),
         by_angle=draws.either(0.5),
         saturation=draws.between(0.8, 2.4),
+        fifth=draws.between(-5e-3, 5e-3) * draws.either(0.5),
     )
 
 

@@ -18,7 +18,7 @@ The map acts on normalised coordinates ``q = (x_u - e) / n``, with the distortio
 half the image width ``n``:
 
     f(q) = 2 q / (1 + sqrt(1 - 4 xi_r r2)) + (xi_t + xi_u (1, -1)) * (r2 + 2 q*q)
-           + (xi_v + xi_w (1, -1)) 2 q_x q_y + xi_s r2 (-q_y, q_x),   r2 = |q|^2
+           + (xi_v + xi_w (1, -1)) 2 q_x q_y + xi_s r2 (-q_y, q_x) + xi_r4 r2^2 q,   r2 = |q|^2
 
 The radial term is the closed form of the division model (Fitzgibbon 2001,
 doi:10.1109/CVPR.2001.990465), the tangential one is the consistent reading of equation (2) of Malti
@@ -27,7 +27,9 @@ to a scalar. It stands for decentring along one diagonal, and xi_u for decentrin
 displaced has the products of both coordinates besides (Brown 1966, Decentering distortion of lenses): along the first
 diagonal xi_v = xi_t, along the other one xi_w = -xi_u. With the centre and the spiral term, all six quadratic patterns
 can be told. The spiral term is the third-order anisotropic distortion of a magnetic lens, which turns what is farther
-from its axis more (Hawkes and Kasper, Principles of Electron Optics, ch. 24).
+from its axis more (Hawkes and Kasper, Principles of Electron Optics, ch. 24). The last term is the isotropic distortion
+of the fifth order, by which a strong one departs from the closed form: k2 of the polynomial model is
+``xi_r4 + 2 xi_r^2``.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.camera.thresholds import LENS_STEPS_MAX, LENS_TOLERANCE
 
-LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u", "xi_v", "xi_w")
+LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u", "xi_v", "xi_w", "xi_r4")
 """The coefficients, in the order in which the functions below take and derive them."""
 PRODUCTS: tuple[str, ...] = ("xi_v", "xi_w")
 """Those of the products of both coordinates."""
@@ -82,6 +84,7 @@ def distort_normalised(
     xi_u: Array | float = 0.0,
     xi_v: Array | float = 0.0,
     xi_w: Array | float = 0.0,
+    xi_r4: Array | float = 0.0,
 ) -> Array:
     """Distort (n, 2) normalised points; NaN rows where ``4 xi_r r2 >= 1``.
 
@@ -90,6 +93,9 @@ def distort_normalised(
     squares = q * q
     r2 = squares[:, 0] + squares[:, 1]
     _, factor = _radial(r2, np.asarray(xi_r, dtype=np.float64))
+    fifth = np.asarray(xi_r4, dtype=np.float64)
+    if np.any(fifth):
+        factor = factor + fifth * r2 * r2
     tangential = np.asarray(xi_t, dtype=np.float64)[..., None] * (r2[:, None] + 2.0 * squares)
     out = factor[:, None] * q + tangential
     spiral, across = np.asarray(xi_s, dtype=np.float64), np.asarray(xi_u, dtype=np.float64)
@@ -112,6 +118,7 @@ def distort_jacobians(
     xi_u: Array | float = 0.0,
     xi_v: Array | float = 0.0,
     xi_w: Array | float = 0.0,
+    xi_r4: Array | float = 0.0,
     *,
     points_only: bool = False,
 ) -> tuple[Array, Array, Array]:
@@ -120,7 +127,7 @@ def distort_jacobians(
     Returns
     -------
     f, df_dq, df_dxi
-        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 6); the last axis of ``df_dxi`` is in the order of
+        Arrays of shape (n, 2), (n, 2, 2) and (n, 2, 7); the last axis of ``df_dxi`` is in the order of
         :data:`LENS_NAMES`.
     """
     xi_radial = np.asarray(xi_r, dtype=np.float64)
@@ -140,6 +147,13 @@ def distort_jacobians(
     df_dq[0, 1] = along * x * y + tangential_y
     df_dq[1, 0] = along * x * y + tangential_x
     df_dq[1, 1] = along * y * y + factor + 3.0 * tangential_y
+    fifth = np.asarray(xi_r4, dtype=np.float64)
+    if np.any(fifth):
+        f = f + (fifth * r2 * r2)[:, None] * q
+        df_dq[0, 0] += fifth * r2 * (r2 + 4.0 * x * x)
+        df_dq[0, 1] += 4.0 * fifth * r2 * x * y
+        df_dq[1, 0] += 4.0 * fifth * r2 * x * y
+        df_dq[1, 1] += fifth * r2 * (r2 + 4.0 * y * y)
     spiral, across = np.asarray(xi_s, dtype=np.float64), np.asarray(xi_u, dtype=np.float64)
     if np.any(across):
         f = f + across[..., None] * bracket * [1.0, -1.0]
@@ -170,6 +184,7 @@ def distort_jacobians(
         df_dxi[3, 0], df_dxi[3, 1] = bracket[:, 0], -bracket[:, 1]
         df_dxi[4] = 2.0 * x * y
         df_dxi[5, 0], df_dxi[5, 1] = df_dxi[4, 0], -df_dxi[4, 1]
+        df_dxi[6] = r2 * r2 * q.T
     return f, np.moveaxis(df_dq, -1, 0), np.moveaxis(df_dxi, (0, 1), (2, 1))
 
 

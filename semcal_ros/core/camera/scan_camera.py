@@ -95,9 +95,10 @@ class ScanCamera:
         Radial and tangential distortion in normalised coordinates.
     ex, ey
         Centre of the distortion, px.
-    xi_s, xi_u, xi_v, xi_w
-        Spiral distortion, the tangential one along the other diagonal, and the products of both coordinates that belong
-        to a displaced lens, in normalised coordinates (see :mod:`semcal_ros.core.camera.distortion`).
+    xi_s, xi_u, xi_v, xi_w, xi_r4
+        Spiral distortion, the tangential one along the other diagonal, the products of both coordinates that belong to
+        a displaced lens, and the radial distortion of the fifth order, in normalised coordinates (see
+        :mod:`semcal_ros.core.camera.distortion`).
     coil_x2 to coil_x7, settling_1 to settling_5, coil_y2 to coil_y7
         Distortion of the scan along the lines and across them (see
         :mod:`semcal_ros.core.camera.scan_distortion`), in half image widths.
@@ -145,6 +146,7 @@ class ScanCamera:
     xi_u: float = 0.0
     xi_v: float = 0.0
     xi_w: float = 0.0
+    xi_r4: float = 0.0
     coil_x2: float = 0.0
     coil_x3: float = 0.0
     coil_x4: float = 0.0

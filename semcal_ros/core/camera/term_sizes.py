@@ -37,7 +37,7 @@ TERM_KINDS: tuple[str, ...] = (
 )
 """The kinds of distortion: of the lens, of the scan, and what both leave."""
 _LENS_KINDS = {
-    "radial": ("xi_r",),
+    "radial": ("xi_r", "xi_r4"),
     "decentring": ("xi_t", "xi_u", "xi_v", "xi_w"),
     "spiral": ("xi_s",),
 }

@@ -99,6 +99,35 @@ def _displaced_lens(g: float) -> ScanCamera:
     return replace(JSM.camera_at(g), xi_r=0.0, xi_t=0.004, xi_u=0.008, xi_v=0.004, xi_w=-0.008)
 
 
+def _strong_lens(g: float) -> ScanCamera:
+    """A lens with radial distortion of the fifth order, 2.4 px in the corner at 250x and none far above."""
+    return replace(JSM.camera_at(g), xi_r4=0.003 * np.exp(-g / 500.0))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("truth", "is_strong"), [(_strong_lens, True), (JSM.camera_at, False)], ids=["strong", "usual"]
+)
+def test_radial_distortion_of_the_fifth_order_is_found(
+    truth: Callable[[float], ScanCamera], is_strong: bool
+) -> None:
+    size, display = JSM.image_size, JSM.display_width_m
+    views = grid_views(
+        truth, (250.0, 500.0, 1000.0, 2000.0, 4000.0), noise_px=0.05, views=4, seed=5
+    )
+    model = calibrate_views(views, image_size=size, display_width_m=display).model
+    assert model.residual is None
+    assert ("xi_r4" in model.functions) == is_strong
+    name = "xi_r4" if is_strong else "xi_r"
+    for g in (350.0, 700.0, 1400.0):
+        ours = model.at(g)
+        sigma = np.sqrt(np.diag(ours.covariance))[ours.names.index(name)]
+        assert abs(getattr(ours, name) - getattr(truth(g), name)) < 4.0 * sigma
+    clean = grid_views(truth, (350.0, 1400.0, 2800.0), noise_px=0.0, views=3, seed=9)
+    # Some 30 coefficients from 20 views with 0.05 px of noise.
+    assert fit_poses(clean, model.at, height_sigma_m=4e-5).rms_px() < 0.03
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("truth", "has_products"),

@@ -28,7 +28,7 @@ from semcal_ros.core.camera.scan_distortion import Raster
 
 RASTER = Raster.of(512, 448)
 BASIC = np.array([4.3e5, 1.01, 0.003, 245.0, 262.0, 50.0, 0.06, -0.012, 231.0, 274.0])
-LENS = [-0.008, 0.003, -0.004, 0.005]
+LENS = [-0.008, 0.003, -0.004, 0.005, 0.006]
 ALONG = [0.004, -0.006, 0.001, 0.002, -0.001, 0.001, 0.001, 0.002, 0.01, -0.003, 0.002]
 ACROSS = [0.003, 0.005, -0.001, 0.002, 0.001, -0.002]
 TERMS = np.array([*LENS, *ALONG, *ACROSS])

@@ -149,6 +149,7 @@ def test_overlaps_are_the_integrals_that_they_say():
         (6 + LENS_NAMES.index("xi_t"), tangential, 1e-12),
         (6 + LENS_NAMES.index("xi_s"), spiral, 1e-12),
         (6 + LENS_NAMES.index("xi_u"), tangential * [1.0, -1.0], 1e-12),
+        (6 + LENS_NAMES.index("xi_r4") - len(PRODUCTS), r2[:, None] * radial, 1e-12),
         (scan + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
         # A decay is no polynomial, nor a coil one beyond the picture: six nodes in each cell are not quite exact.
         (scan + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),

@@ -149,6 +149,12 @@ def test_the_products_of_both_coordinates_known_answer():
     np.testing.assert_allclose(across, [[383.5 - 0.64, 127.5 + 0.64]], atol=1e-9)
 
 
+def test_the_radial_distortion_of_the_fifth_order_known_answer():
+    # q = (0.5, -0.5): r2 is 0.5, and xi_r4 r2^2 q is 0.01 / 4 (0.5, -0.5).
+    raw = replace(PLAIN, xi_r4=0.01).distort([[383.5, 63.5]])
+    np.testing.assert_allclose(raw, [[383.5 + 0.32, 63.5 - 0.32]], atol=1e-9)
+
+
 @pytest.mark.parametrize("displaced", [(0.003, 0.0), (0.0, -0.002), (0.001, 0.004)])
 def test_decentring_has_the_form_of_brown_in_any_direction(displaced):
     """Brown 1966, with the displacement d: d r2 + 2 q (q . d)."""

@@ -57,6 +57,8 @@ def test_a_camera_without_distortion_has_none_of_any_kind():
             "radial",
             256.0 * np.sqrt(2.0) * END * (2.0 / (1.0 + np.sqrt(1.0 - 0.08 * END**2)) - 1.0),
         ),
+        # xi_r4 r2^2 q is 0.01 * 4 (1, 1).
+        ({"xi_r4": -0.01}, "radial", 10.24 * np.sqrt(2.0) * END**5),
         # xi_t (r2 + 2 q*q) is 0.01 (4, 4).
         ({"xi_t": 0.01}, "decentring", 10.24 * np.sqrt(2.0) * END**2),
         ({"xi_u": -0.01}, "decentring", 10.24 * np.sqrt(2.0) * END**2),
@@ -116,7 +118,13 @@ def test_the_residual_field_is_what_it_displaces():
 def test_all_kinds_together_are_what_the_camera_does():
     """First the lens, then the scan, then the field; to first order they add up."""
     tiny = {"xi_r": 2e-5, "xi_t": -1e-5, "xi_s": 1e-5, "xi_u": 2e-5, "xi_v": -1e-5, "xi_w": 3e-5}
-    tiny |= {"coil_x3": 1e-5, "coil_y2": -2e-5, "settling_2": 1e-5, "settling_4": -1e-5}
+    tiny |= {
+        "xi_r4": -1e-5,
+        "coil_x3": 1e-5,
+        "coil_y2": -2e-5,
+        "settling_2": 1e-5,
+        "settling_4": -1e-5,
+    }
     camera = replace(PLAIN, ex=240.0, ey=271.0, **tiny)
     xy = np.random.default_rng(0).uniform(0.0, 511.0, (50, 2))
     lens, scan = (

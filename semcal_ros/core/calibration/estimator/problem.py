@@ -67,7 +67,8 @@ class Priors:
         Inverse pivot distance, 1/m: 20 mm is typical, and 8 mm as well as a parallel projection are
         within 1.5 sigma.
     xi_r_sigma, xi_t_sigma, xi_s_sigma, scan_sigma
-        Distortion about zero, of the lens and of the scan: the latter is some px at a width of 512.
+        Distortion about zero, of the lens and of the scan: the latter is some px at a width of 512. ``xi_t`` stands for
+        all decentring and for the radial distortion of the fifth order.
     aspect_sigma, skew_sigma, scale_sigma
         About 1, 0 and the nominal scale.
     scale_jump, aspect_jump, skew_jump
@@ -251,7 +252,7 @@ class Setup:
             "xi_r": p.xi_r_change,
             "xi_t": p.xi_t_change,
             "xi_s": p.xi_s_change,
-            **dict.fromkeys(("xi_u", *PRODUCTS), p.xi_t_change),
+            **dict.fromkeys(("xi_u", *PRODUCTS, "xi_r4"), p.xi_t_change),
             "ex": centre,
             "ey": centre,
             **dict.fromkeys(SCAN_NAMES, p.scan_change),
@@ -304,7 +305,7 @@ class Setup:
             "ex": (cx, p.distortion_centre_fraction * width),
             "ey": (cy, p.distortion_centre_fraction * width),
             "xi_s": (0.0, p.xi_s_sigma),
-            **dict.fromkeys(("xi_u", *PRODUCTS), (0.0, p.xi_t_sigma)),
+            **dict.fromkeys(("xi_u", *PRODUCTS, "xi_r4"), (0.0, p.xi_t_sigma)),
             **dict.fromkeys(SCAN_NAMES, (0.0, p.scan_sigma)),
         }[name]
 
