@@ -81,8 +81,13 @@ from semcal_ros.core.calibration.estimator.thresholds import (
 )
 from semcal_ros.core.camera.calibration_model import columns_of
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
+from semcal_ros.core.camera.distortion import LENS_NAMES
 from semcal_ros.core.camera.records import Certificate
 from semcal_ros.core.errors import UnusableCalibrationError
+
+PADDED = tuple(dict.fromkeys((*SMOOTH_AT_LAST, *LENS_NAMES)))
+"""The functions whose form between the magnifications is uncertain, where they are there: all but those of the scan,
+which hardly change, and the constants."""
 
 
 def certify(functions: Functions, problem: Problem, result: BundleResult) -> Certificate:
@@ -321,7 +326,7 @@ class PaddedAdjustment:
 def pad(setup: Setup, adjustment: Adjustment) -> PaddedAdjustment:
     """Return the adjustment with a few more coefficients; ``setup`` has the views that it was made of."""
     # What a further term may do besides is a residual field's, where there is one.
-    names = SMOOTH if setup.corrected else SMOOTH_AT_LAST
+    names = SMOOTH if setup.corrected else PADDED
     functions = _pad_functions(adjustment.functions, names)
     problem = build_problem(setup, functions, setup.views, adjustment.spread)
     state = adjustment.result.state
@@ -391,7 +396,7 @@ def _changes_that_fall(
     changing = {
         name: slice(own.start + 1, own.start + padded[name].smooth_size)
         for name, own in columns_of(padded).items()
-        if name in SMOOTH_AT_LAST and padded[name].smooth_size > 1
+        if name in PADDED and padded[name].smooth_size > 1
     }
     usual_sigma, theta = problem.prior_sigma.copy(), result.state.theta
     for name, own in changing.items():
