@@ -72,7 +72,8 @@ class DriftFilter:
     Attributes
     ----------
     start
-        State at the time at which the drift is zero.
+        State from which the :attr:`log` leads to the present one: that at which the drift is zero, as long as all events
+        are kept.
     state
         State now.
     process_noise
@@ -146,7 +147,7 @@ class DriftFilter:
         if self.keeps_history:
             return replace(self, log=self.log.with_item(Mark()))
         if self.unmeasured is None and self.measured >= ESTIMATED_AFTER[-1]:
-            return replace(self, log=SharedSequence())
+            return replace(self, start=self.state, log=SharedSequence())
         return self
 
     def add_keyframe(self, key: int, removed: Array, acceleration_term_s2: float) -> DriftFilter:

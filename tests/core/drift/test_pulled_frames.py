@@ -23,7 +23,7 @@ from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import limit_by_pull, widen_earlier
-from semcal_ros.core.drift.operations import CloneKeyframe, Measure, Predict
+from semcal_ros.core.drift.operations import AddKeyframe, CloneKeyframe, Measure, Predict
 from semcal_ros.core.drift.smoother import Mark, estimate_process_noise, separate_common, smooth
 from semcal_ros.core.drift.state import BASE_SIZE, DriftState
 from semcal_ros.core.drift.tracker import DriftTracker
@@ -104,6 +104,21 @@ def test_earlier_frames_were_pulled_by_as_much_less_as_they_moved_less() -> None
     assert widen_earlier(widened, latest, pull) is widened
     weak = np.array([4.0 * NOISE, 0.0])
     assert widen_earlier(filtered, _measure(np.array([0.0, 2.0]), weak), weak) is filtered
+
+
+def test_a_frame_that_is_measured_twice_is_widened_where_earlier_ones_are_no_longer_kept() -> None:
+    """Without a smoother, events are kept as long as the process noise is estimated from them: 16 measurements."""
+    start, nothing = _filter().start.without_keyframes(), np.zeros(2)
+    filtered = DriftFilter.begin(start, 1e-6, keeps_history=False)
+    filtered = filtered.apply(AddKeyframe(0, np.zeros(4), 0.0, 1e-8 * np.eye(4), 1.0))
+    for k in range(1, 31):
+        filtered = filtered.apply(Predict(float(k))).update(_measure(nothing, nothing)).mark_frame()
+    twice = filtered.apply(Predict(31.0)).update(_measure(np.array([0.0, 2.0]), nothing))
+    pull = np.array([0.8, 0.0])
+    widened = widen_earlier(twice, _measure(np.array([0.0, 2.0]), pull), pull)
+    assert _sigmas(widened)[0] > _sigmas(twice)[0]
+    # The frames before stay as they were.
+    assert _sigmas(widened)[0] < 1.05 * _sigmas(filtered.apply(Predict(31.0)))[0]
 
 
 def test_the_covariance_of_a_pull_is_told_apart_from_that_of_the_noise() -> None:
