@@ -72,8 +72,8 @@ class DriftFilter:
     Attributes
     ----------
     start
-        State from which the :attr:`log` leads to the present one: that at which the drift is zero, as long as all events
-        are kept.
+        State from which the :attr:`log` leads to the present one: that at which the drift is zero, as long as all
+        events are kept.
     state
         State now.
     process_noise

@@ -41,7 +41,9 @@ from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, SEEN_AWAY, MatchFailure
 
 # What an image looks like that shows another place: the prediction need not hold.
-_ELSEWHERE = frozenset({MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR})
+_ELSEWHERE = frozenset(
+    {MatchFailure.NO_PEAK, MatchFailure.DISSIMILAR, MatchFailure.DEFECTS_ELSEWHERE}
+)
 
 
 def coast(

@@ -132,8 +132,10 @@ def _has_stripes(left: Image, image: Image) -> bool:
         return False
     # A specimen of lines leaves some of them where the shift is a little off, and nothing else tells its place.
     whole = _profile(image, seen)[0].mean(axis=0)
-    gradient = np.diff(image, axis=0)
-    share = image.shape[1] * float(np.sum(np.diff(whole) ** 2)) / float(np.sum(gradient**2))
+    # What is left of both images is the noise of both.
+    own, noise = (float(np.sum(np.diff(each, axis=0) ** 2)) for each in (image, left))
+    of_specimen = max(own - 0.5 * noise, 1e-3 * own)
+    share = image.shape[1] * float(np.sum(np.diff(whole) ** 2)) / of_specimen
     return share < STRIPE_SHARE_MAX or float(np.sum(common**2)) > 0.5 * float(np.sum(whole**2))
 
 

@@ -61,6 +61,7 @@ from semcal_ros.core.drift.thresholds import (
     STRIPE_CELLS_MIN,
     STRIPE_CELLS_TRIED,
     STRIPE_CHI2_MIN,
+    STRIPE_MOVE_PX_MAX,
     STRIPE_TRIES,
     VELOCITY_CHANGE,
     ZOOM_MIN,
@@ -297,7 +298,11 @@ def _follow_without_stripes(
     # Lines pull along y, and columns along x.
     to_px = frame.px_from_unit
     apart = without.drift_m - with_them.drift_m
-    squares = (to_px @ apart) ** 2 / np.diag(to_px @ without.covariance[:2, :2] @ to_px.T)
+    apart_px = to_px @ apart
+    if np.hypot(*apart_px) > STRIPE_MOVE_PX_MAX:
+        # No stripes pull that far: it is another match, such as one that is a period of the specimen away.
+        return found
+    squares = apart_px**2 / np.diag(to_px @ without.covariance[:2, :2] @ to_px.T)
     pulled = Stripes(*(squares[::-1] > STRIPE_CHI2_MIN).tolist()) & static.stripes
     known = state.static.stripes
     if known | pulled == known:

@@ -246,7 +246,7 @@ def choose_period(
     if isinstance(told, ChosenShift):
         return told
     nearest = min(compared, key=lambda c: float(np.hypot(*(c.shift_px - guess))))
-    is_open = best is nearest or told.status is MatchFailure.DISSIMILAR
+    is_open = best is nearest or told.status is MatchFailure.DEFECTS_ELSEWHERE
     return UntoldShift(told, np.full(2, np.nan) if is_open else best.shift_px)
 
 
@@ -272,7 +272,7 @@ def _find_rival(
     against = DEFECT_EVIDENCE_MAX * left
     if against >= EVIDENCE_MIN or against > _weigh(best, rival)[0]:
         reason += f", and with {left} of them elsewhere"
-        return Rejection(MatchFailure.DISSIMILAR, reason)
+        return Rejection(MatchFailure.DEFECTS_ELSEWHERE, reason)
     return Rejection(MatchFailure.AMBIGUOUS, reason)
 
 
@@ -478,8 +478,14 @@ def _tells(first: _Candidate, second: _Candidate, least: float) -> bool:
 
 
 def _is_worse_everywhere(first: _Candidate, second: _Candidate) -> bool:
-    """Whether the first of two shifts leaves more of the structure than the second in most tiles."""
-    return _are_left(first.energies - second.energies, second, first.counted)
+    """Whether the first of two shifts leaves more of the structure than the second in most tiles.
+
+    A tile that shows less structure than noise does not say so: where the image is brighter, more noise is left there.
+    """
+    excess = first.energies - second.energies
+    # What the better one leaves is the noise of both images.
+    shows = second.structure > 0.5 * second.energies
+    return _are_left(np.where(shows, excess, np.minimum(excess, 0.0)), second, first.counted)
 
 
 def _leaves_structure(candidate: _Candidate, noise: TileNoise) -> bool:

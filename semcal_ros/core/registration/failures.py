@@ -46,6 +46,8 @@ class MatchFailure(Enum):
     HALVES_DISAGREE = "halves disagree"
     #: The images have too little of their structure in common.
     DISSIMILAR = "dissimilar"
+    #: Of a specimen that repeats itself, defects are elsewhere at each of the shifts that were compared.
+    DEFECTS_ELSEWHERE = "defects elsewhere"
     #: The shift is so large that the stage must have moved.
     STAGE_MOVE = "stage move"
     #: The shift is far from what the drift so far predicts.

@@ -208,7 +208,7 @@ def test_a_prediction_hides_no_jump_by_a_period(jump: tuple[int, int], defects: 
     found = compare(first, second, shift, 0.3)
     if found.accepted:
         np.testing.assert_allclose(found.shift_px, at, atol=0.1)
-    elif found.rejection is not None and found.rejection.status is MatchFailure.DISSIMILAR:
+    elif found.rejection is not None and found.rejection.status is MatchFailure.DEFECTS_ELSEWHERE:
         assert defects, found.reason
     elif defects:
         # It is not believed, but that the specimen is elsewhere is said.
