@@ -73,7 +73,7 @@ from semcal_ros.core.calibration.thresholds import (
     FIELD_ROUNDS,
     FIELD_SETTLED_PX,
     FREE_ROUNDS,
-    PRODUCT_GAIN,
+    LATE_TERM_GAIN,
     SCAN_SIZE_MAX,
     SIZE_MAX,
     TERM_GAIN,
@@ -81,7 +81,7 @@ from semcal_ros.core.calibration.thresholds import (
 from semcal_ros.core.calibration.views import estimate_excess_sigma_px
 from semcal_ros.core.camera.calibration_model import ALL_FUNCTIONS, TERM_NAMES, with_coefficients
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.distortion import PRODUCTS
+from semcal_ros.core.camera.distortion import LATE_TERMS, PRODUCTS
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
 from semcal_ros.core.errors import UnusableCalibrationError
@@ -413,19 +413,19 @@ def select_and_adjust(
     choose_terms: bool = True,
 ) -> Adjustment:
     """Choose the number of coefficients of every function, and further terms of the camera but for the
-    :data:`PRODUCTS`, until the choice no longer changes.
+    :data:`LATE_TERMS`, until the choice no longer changes.
 
     Products that are there stay. Beside a residual field the terms stay as they are, since it takes the place of those
     that are not there.
     """
-    always = (*always, *(name for name in PRODUCTS if name in functions))
+    always = (*always, *(name for name in LATE_TERMS if name in functions))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
     converged, rounds = False, 0
     terms: tuple[str, ...] = ()
     if choose_terms and not setup.priors.is_wide:
-        terms = tuple(name for name in TERM_NAMES if name not in (*always, *PRODUCTS))
+        terms = tuple(name for name in TERM_NAMES if name not in (*always, *LATE_TERMS))
     while rounds < CHOICE_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=(*always, *terms))
@@ -446,29 +446,38 @@ def select_and_adjust(
     return Adjustment(functions, problem, result, spread, rounds, converged)
 
 
-def add_products(
+def add_late_terms(
     setup: Setup, adjustment: Adjustment, *, always: Sequence[str] = SMOOTH
 ) -> Adjustment:
-    """Return the adjustment with those :data:`PRODUCTS` that explain what it leaves; unchanged where none does.
+    """Return the adjustment with those :data:`LATE_TERMS` that explain what it leaves; unchanged where none does.
 
-    With a radial distortion they are much like another centre, so that offered with all other terms, where a fit began
-    would decide between the two. All other functions keep their numbers of coefficients while these are judged, and
-    choose them again after it.
+    With a radial distortion the products are much like another centre, and the fifth order is much like coils that are
+    not linear, so that offered with all other terms, where a fit began would decide between the two. All other
+    functions keep their numbers of coefficients while these are judged, and choose them again after it. The products
+    are judged first: a centre far off, which takes their place, looks like the fifth order.
     """
+    for names in (PRODUCTS, LATE_TERMS):
+        adjustment = _add_terms(setup, adjustment, names, always)
+    return adjustment
+
+
+def _add_terms(
+    setup: Setup, adjustment: Adjustment, names: Sequence[str], always: Sequence[str]
+) -> Adjustment:
     functions, spread = adjustment.functions, adjustment.spread
-    offered = [name for name in PRODUCTS if name not in functions]
+    offered = [name for name in names if name not in functions]
     if setup.priors.is_wide or not offered:
         return adjustment
-    every = build_problem(setup, functions, setup.views, spread, candidates=PRODUCTS)
+    every = build_problem(setup, functions, setup.views, spread, candidates=offered)
     summary = Summary.of(every, refine(every, adjustment.result.state, max_iterations=0))
-    candidates = Candidates(summary, setup, functions, PRODUCTS)
+    candidates = Candidates(summary, setup, functions, offered)
     now = {name: (own.kind, own.smooth_size) for name, own in functions.items()}
     most = min(SCAN_SIZE_MAX, max(len(setup.magnifications) - 1, 1))
     tried = [
         dict(zip(offered, (("chebyshev_log", count) for count in counts), strict=True))
         for counts in itertools.product(range(most + 1), repeat=len(offered))
     ]
-    prices = [sum(_price(count, PRODUCT_GAIN) for _, count in added.values()) for added in tried]
+    prices = [sum(_price(count, LATE_TERM_GAIN) for _, count in added.values()) for added in tried]
     costs = [candidates.score(now | added) + own for added, own in zip(tried, prices, strict=True)]
     best = tried[int(np.argmin(costs))]
     if not any(count for _, count in best.values()):
@@ -592,13 +601,13 @@ def select(started: Start, residual: str) -> Selection:
         adjustment, field, pattern = _add_field(noisy, adjustment, always=True)
         return Selection(setup, adjustment, field, pattern, excess_px(setup, adjustment))
     plain = noisy, adjustment
-    more = add_products(noisy, adjustment)
+    more = add_late_terms(noisy, adjustment)
     if more is not adjustment:
         noisy, adjustment = _anneal(setup, noisy, more)
     if residual == "auto":
         adjustment, field, pattern = _add_field(noisy, adjustment, always=False)
         if field is not None and more is not plain[1]:
-            # What the products stood for is a part of what the field describes, which has them among its patterns.
+            # What the late terms stood for is a part of what the field describes, which has them among its patterns.
             # Where there is no solution without them, they stay.
             with suppress(UnusableCalibrationError):
                 instead = _add_field(*plain, always=True)

@@ -65,7 +65,7 @@ from semcal_ros.core.calibration.estimator.variance_components import (
     limit_components,
     update_components,
 )
-from semcal_ros.core.calibration.select import Selection, add_products, select_and_adjust
+from semcal_ros.core.calibration.select import Selection, add_late_terms, select_and_adjust
 from semcal_ros.core.calibration.start import with_excess
 from semcal_ros.core.calibration.thresholds import (
     EXACT_STEPS_MAX,
@@ -205,7 +205,7 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         choose_terms=field is None,
     )
     if field is None:
-        adjustment = add_products(final, adjustment, always=SMOOTH_AT_LAST)
+        adjustment = add_late_terms(final, adjustment, always=SMOOTH_AT_LAST)
     adjustment = _adjust_exactly(final, adjustment)
     _refuse_lost_corners(final, adjustment)
     if field is not None:

@@ -263,11 +263,11 @@ TERM_GAIN = TABLE.derived(
     "For a term that is not there yet: by chance one of 640 that are not needed, twice as much being a chi-square "
     "of one degree of freedom.",
 )
-PRODUCT_GAIN = TABLE.derived(
-    "PRODUCT_GAIN", 10.0, "half chi-square",
+LATE_TERM_GAIN = TABLE.derived(
+    "LATE_TERM_GAIN", 10.0, "half chi-square",
     "For a product of both coordinates: that of a term, and five coefficients. A centre of the distortion that moves "
     "in both directions as a parabola in log g, with decentring along it, does the same with that many more. "
-    "Microscopes with a displaced lens were seen to gain 25 to 2475, others 8 at most.",
+    "Microscopes with a displaced lens were seen to gain 25 to 2475, others 8 at most. The fifth order has the same.",
 )
 SCAN_SIZE_MAX = TABLE.measured(
     "SCAN_SIZE_MAX", 3, "coefficients",

@@ -45,6 +45,8 @@ LENS_NAMES: tuple[str, ...] = ("xi_r", "xi_t", "xi_s", "xi_u", "xi_v", "xi_w", "
 """The coefficients, in the order in which the functions below take and derive them."""
 PRODUCTS: tuple[str, ...] = ("xi_v", "xi_w")
 """Those of the products of both coordinates."""
+LATE_TERMS: tuple[str, ...] = (*PRODUCTS, "xi_r4")
+"""Those that are much like what others do together: the products, and the fifth order."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from semcal_ros.core.calibration.estimator.problem import Priors, Setup, constan
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.select import Candidates, Summary, select_functions
-from semcal_ros.core.camera.distortion import PRODUCTS
+from semcal_ros.core.camera.distortion import LATE_TERMS
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import grid_views
@@ -145,7 +145,7 @@ def test_products_of_both_coordinates_are_there_for_a_displaced_lens(
     )
     model = calibrate_views(views, image_size=size, display_width_m=display).model
     assert model.residual is None
-    assert any(name in model.functions for name in PRODUCTS) == has_products
+    assert any(name in model.functions for name in LATE_TERMS) == has_products
     clean = grid_views(truth, (350.0, 1400.0, 2800.0), noise_px=0.0, views=3, seed=9)
     # Some 30 coefficients from 20 views with 0.05 px of noise; without products the displaced lens is 0.07 px off.
     assert fit_poses(clean, model.at, height_sigma_m=4e-5).rms_px() < 0.03

@@ -45,7 +45,7 @@ from semcal_ros.core.camera.calibration_model import (
     stack_coefficients,
 )
 from semcal_ros.core.camera.continuous_function import ContinuousFunction
-from semcal_ros.core.camera.distortion import PRODUCTS
+from semcal_ros.core.camera.distortion import LATE_TERMS
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, Raster
 
@@ -252,7 +252,7 @@ class Setup:
             "xi_r": p.xi_r_change,
             "xi_t": p.xi_t_change,
             "xi_s": p.xi_s_change,
-            **dict.fromkeys(("xi_u", *PRODUCTS, "xi_r4"), p.xi_t_change),
+            **dict.fromkeys(("xi_u", *LATE_TERMS), p.xi_t_change),
             "ex": centre,
             "ey": centre,
             **dict.fromkeys(SCAN_NAMES, p.scan_change),
@@ -305,7 +305,7 @@ class Setup:
             "ex": (cx, p.distortion_centre_fraction * width),
             "ey": (cy, p.distortion_centre_fraction * width),
             "xi_s": (0.0, p.xi_s_sigma),
-            **dict.fromkeys(("xi_u", *PRODUCTS, "xi_r4"), (0.0, p.xi_t_sigma)),
+            **dict.fromkeys(("xi_u", *LATE_TERMS), (0.0, p.xi_t_sigma)),
             **dict.fromkeys(SCAN_NAMES, (0.0, p.scan_sigma)),
         }[name]
 
