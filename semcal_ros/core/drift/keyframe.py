@@ -32,6 +32,7 @@ from semcal_ros.core.drift.thresholds import (
     BLUR_BELOW,
     COMMON_PX_MIN,
     FRAMES_AVERAGED,
+    KEPT_CORRELATION_MIN,
     MERGED_GAINS,
     PIXEL_SIGMA_PX,
     USUAL_RATIO,
@@ -73,6 +74,8 @@ class Keyframe:
         The least that any frame left unexplained, grey levels.
     worn
         How many frames in a row have left much more.
+    differs
+        Whether the latest frame agreed so little with it that the specimen may have changed.
     changes
         How often the specimen had changed since the first keyframe of the chain from which this one was measured.
     """
@@ -88,6 +91,7 @@ class Keyframe:
     compared: int = 0
     residual: float = float("inf")
     worn: int = 0
+    differs: bool = False
     changes: int = 0
 
     @property
@@ -137,7 +141,8 @@ class Keyframe:
         # With less contrast, it does not say what a usual one leaves.
         is_usual = registration.contrast > MERGED_GAINS[0]
         least = min(residual, self.residual) if is_usual else self.residual
-        return replace(self, residual=least, worn=worn)
+        differs = registration.correlation < KEPT_CORRELATION_MIN
+        return replace(self, residual=least, worn=worn, differs=differs)
 
     def with_frame(
         self,

@@ -37,7 +37,6 @@ from semcal_ros.core.drift.thresholds import (
     BLUR_PX_MAX,
     COPY_NOISE,
     COPY_NOISE_BESIDE,
-    KEPT_CORRELATION_MIN,
     MERGED_CORRELATION_MIN,
     MERGED_GAINS,
     MERGED_SHEAR_PX_MAX,
@@ -148,11 +147,13 @@ def renew_keyframe(
         # It became a keyframe when it was measured.
         return state, make_update(state, frame, DriftStatus.KEYFRAME, registration=registration)
     store = state.keyframes.use(candidate.key)
-    noted = store[candidate.key].note_match(registration)
+    latest = store[candidate.key]
+    noted = latest.note_match(registration)
     state = replace(state, keyframes=store.replace(candidate.key, noted))
     status, merged = DriftStatus.TRACKED, False
     overlap, enough = registration.alignment.overlap, setup.settings.rekey_overlap
-    is_changed = registration.correlation < KEPT_CORRELATION_MIN or (
+    # A single frame that differs may show another place in a part of its lines, and would hide the move to it.
+    is_changed = (noted.differs and latest.differs) or (
         # A tool that comes in is no change of the specimen.
         noted.is_worn and registration.moving is None and not registration.alignment.may_be_pulled
     )

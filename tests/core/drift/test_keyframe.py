@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift import tracker
 from semcal_ros.core.drift.camera_uncertainty import (
     apparent_zoom_shift,
     centre_covariance,
@@ -36,6 +37,7 @@ from semcal_ros.core.drift.camera_uncertainty import (
     visit_stretch_covariance,
     zoom_covariance,
 )
+from semcal_ros.core.drift.estimates import DriftStatus, DriftUpdate
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
 from semcal_ros.core.drift.keyframe import (
     Keyframe,
@@ -44,8 +46,10 @@ from semcal_ros.core.drift.keyframe import (
     scale_ratio,
 )
 from semcal_ros.core.drift.keyframe_store import KeyframeStore
+from semcal_ros.core.drift.matching import Match
 from semcal_ros.core.drift.state import DriftState, initial_state
-from semcal_ros.core.drift.thresholds import VISIT_SCALE
+from semcal_ros.core.drift.thresholds import KEPT_CORRELATION_MIN, VISIT_SCALE
+from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
 from semcal_ros.core.errors import InvalidValueError
 from semcal_ros.core.registration.fractional_delay import FINE
 from semcal_ros.core.registration.inverse_compositional import unmeasured_alignment
@@ -292,6 +296,38 @@ def test_three_frames_in_a_row_that_leave_half_as_much_again_wear_a_keyframe_out
     for residual in residuals:
         key = key.note_match(left(residual))
     assert key.is_worn == worn
+
+
+def test_a_frame_that_differs_alone_becomes_no_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of one frame may show the specimen before a move of the stage, and half of it after the move: as a keyframe,
+    it hid moves of 15 px for good. A specimen that has changed differs in the next frame, too.
+    """
+    odd: set[int] = set()
+    renew = tracker.renew_keyframe
+
+    def renew_oddly(
+        setup: TrackerSetup, state: TrackerState, frame: ScanFrame, match: Match
+    ) -> tuple[TrackerState, DriftUpdate]:
+        if round(state.filter.state.time_s) in odd:
+            low = 0.9 * KEPT_CORRELATION_MIN
+            match = replace(match, registration=replace(match.registration, correlation=low))
+        return renew(setup, state, frame, match)
+
+    monkeypatch.setattr(tracker, "renew_keyframe", renew_oddly)
+    texture = Texture(1)
+    pictures = [noisy(texture.view((0.1 * k, 0.0), 128), 8.0, k, contrast=13.0) for k in range(8)]
+
+    def list_keyframes(*frames: int) -> list[int]:
+        odd.clear()
+        odd.update(frames)
+        own = tracker.DriftTracker()
+        updates = [own.update(picture, float(k)) for k, picture in enumerate(pictures)]
+        return [k for k, u in enumerate(updates) if u.status is DriftStatus.KEYFRAME]
+
+    assert list_keyframes() == [0]
+    assert list_keyframes(3) == [0]
+    assert list_keyframes(3, 5) == [0]
+    assert list_keyframes(3, 4) == [0, 4]
 
 
 def test_more_or_less_contrast_wears_no_keyframe_out() -> None:
