@@ -219,7 +219,16 @@ def _find_straight_lines(before: AnyImage, now: AnyImage, level: int, noise: flo
         is_sharp = first >= (1.0 - OVERLAY_SHARP_MAX) * second - allowed
         edges[turn][:-2] |= runs[turn][:-2] & beside[turn][1:-1] & is_sharp
     _, labels = cv2.connectedComponents(runs.astype(np.uint8), connectivity=8)
-    return runs & np.isin(labels, np.unique(labels[edges]))
+    found = runs & np.isin(labels, np.unique(labels[edges]))
+    # To the ends of the lines, for which the windows are too long.
+    along = np.ones((1, OVERLAY_LINE_PX), np.uint8)
+    found |= both & (cv2.dilate(found.astype(np.uint8), along) > 0)
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
+    for x, y, width, height, area in boxes[1:].tolist():
+        if 2 * area > width * height:
+            # The ground of a data bar, with what is written on it, such as digits that change.
+            found[y : y + height, x : x + width] = True
+    return found
 
 
 def _find_changing_letters(before: AnyImage, now: AnyImage, core: Mask) -> Mask:

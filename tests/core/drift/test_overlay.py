@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -188,6 +190,25 @@ def test_a_drift_of_few_particles_is_not_held_by_a_counter(noise: float) -> None
         error = np.abs(update.drift_px - shift)
         assert np.all(error < np.maximum(4.0 * np.sqrt(np.diag(update.covariance)[:2]), 0.1))
         assert np.all(error < 0.6)
+
+
+def write_bar(image: np.ndarray, number: int) -> np.ndarray:
+    """The picture with a black data bar below, with text and a counter in it."""
+    out = image.copy()
+    out[-30:] = 0
+    text = f"15.0kV x5.00k {number:04d}"
+    cv2.putText(out, text, (6, SIZE - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.35, 255, 1, cv2.LINE_AA)
+    return out
+
+
+def test_all_of_a_data_bar_is_found_also_where_a_digit_in_it_changes() -> None:
+    """Its ends and the place of the digit were not, and outweighed small particles: no frame was tracked."""
+    pictures = [particles((0.3 * k, 0.0), k, peak=90.0, noise=10.0) for k in range(8)]
+    for k, (first, second) in enumerate(itertools.pairwise(pictures)):
+        found = find_overlay(write_bar(first, k), write_bar(second, k + 1))
+        assert found is not None
+        assert np.all(found[-30:])
+        assert not np.any(found[:-34])
 
 
 def test_what_is_drawn_is_kept_for_some_looks() -> None:
