@@ -207,6 +207,8 @@ def _follow(
     if not candidates:
         ratio = state.keyframes.smallest_scale_ratio(frame)
         reason = f"scale changed by a factor of {ratio:.2f}"
+        if not np.isfinite(ratio):
+            reason = "image of {} x {} px: no earlier one has this size".format(*frame.size)
         return restart(setup, state, frame, Rejection(MatchFailure.SCALE_CHANGE, reason))
     if state.lines.unseen is not None:
         # What was seen in both directions can tell them again.

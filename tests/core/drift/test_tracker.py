@@ -156,6 +156,17 @@ def test_carries_drift_through_changes_of_magnification() -> None:
     assert np.all(np.abs(np.array(run.errors_px)) < 4.0 * np.array(run.sigmas_px) + 0.05)
 
 
+def test_another_size_of_pictures_without_a_camera_is_said() -> None:
+    texture, tracker = Texture(1), DriftTracker()
+    sizes = [128, 128, 96, 96]
+    updates = [
+        tracker.update(noisy(texture.view((0.1 * k, 0.0), n), 8.0, k, contrast=13.0), float(k))
+        for k, n in enumerate(sizes)
+    ]
+    told = "coasting: image of 96 x 96 px: no earlier one has this size"
+    assert [u.status_text for u in updates] == ["keyframe", "tracked", told, "tracked"]
+
+
 def test_too_large_a_change_coasts_and_says_so() -> None:
     run = Run((0.15e-6, -0.1e-6))
     for k in range(3):
