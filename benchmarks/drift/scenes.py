@@ -117,6 +117,23 @@ def lattice(rng: Rng, defects: int = 14) -> Floats:
     return out
 
 
+def powder(rng: Rng) -> Floats:
+    """Particles of a few pixels."""
+    return 0.2 + _discs(rng, 300, (0.7, 1.5), (0.3, 0.7))
+
+
+def pads(rng: Rng) -> Floats:
+    """Squares along the rows, half of the pitch wide, with few particles."""
+    # Whole pitches fit into the torus.
+    pitch = TORUS / int(rng.integers(6, 14))
+    off = rng.uniform(0.0, pitch, 2)
+    y, x = (
+        np.clip(0.25 * pitch - np.abs((np.arange(TORUS) - o) % pitch - 0.5 * pitch) + 0.5, 0.0, 1.0)
+        for o in off
+    )
+    return 0.25 + 0.35 * y[:, None] * x[None, :] + _discs(rng, 10, (2.0, 4.0), (0.3, 0.5))
+
+
 def ridges(rng: Rng) -> Floats:
     field = _spectrum(rng, lambda f: np.exp(-(((f - 0.05) / 0.012) ** 2)))
     return np.asarray(0.3 + 0.25 * np.tanh(3.0 * (field - 0.5) / 0.17))
@@ -321,6 +338,23 @@ def data_bar(frame: Frame, k: int, rng: Rng) -> Frame:
     return Frame(frame.picture, shown, drawn)
 
 
+def counter_in_bar(frame: Frame, k: int, rng: Rng) -> Frame:
+    """A black data bar with text, of which one digit is another one in each frame."""
+    drawn, shown = np.full((SIZE, SIZE), np.nan), frame.shown.copy()
+    bar = np.zeros((36, SIZE), np.uint8)
+    text = f"15.0kV x5.00k {k:04d}"
+    cv2.putText(bar, text, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 255, 1, cv2.LINE_AA)
+    # Black is the least grey level of all.
+    drawn[-36:], shown[-36:] = bar / 255.0 * 1.225 - 0.05, 0.0
+    return Frame(frame.picture, shown, drawn)
+
+
+def uneven(frame: Frame, k: int, rng: Rng) -> Frame:
+    """Light, or a detector, from one side: a quarter more and a quarter less than in the middle."""
+    across = np.linspace(-0.25, 0.25, SIZE)
+    return Frame(frame.picture * (1.0 + across[None, :] + 0.4 * across[:, None]), frame.shown)
+
+
 def spots(frame: Frame, k: int, rng: Rng) -> Frame:
     """Burnt spots of the detector and a cross-hair, which never move."""
     picture, drawn = frame.picture.copy(), np.full((SIZE, SIZE), np.nan)
@@ -417,6 +451,7 @@ KINDS: dict[str, Kind] = {
     "pores and a jump": Kind(pores, jump_px=20.0),
     "dusty grating": Kind(dusty_grating),
     "lattice": Kind(lattice),
+    "pads along the rows": Kind(pads, uneven, electrons=30.0),
     "tool over gold": Kind(gold, tool),
     "tool over sparse": Kind(sparse, tool),
     "tool over gold from the start": Kind(gold, tool_from_start),
@@ -430,6 +465,7 @@ KINDS: dict[str, Kind] = {
     "gripper over sparse": Kind(sparse, gripper, electrons=15.0),
     "shadow": Kind(gold, shadow),
     "data bar": Kind(gold, data_bar),
+    "counter over powder": Kind(powder, counter_in_bar),
     "hum over gold": Kind(gold, hum),
     "hum over fibres": Kind(fibres, hum),
     "lines of their own": Kind(gold, own_lines),
