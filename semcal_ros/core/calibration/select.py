@@ -477,9 +477,23 @@ def _add_terms(
         dict(zip(offered, (("chebyshev_log", count) for count in counts), strict=True))
         for counts in itertools.product(range(most + 1), repeat=len(offered))
     ]
-    prices = [sum(_price(count, LATE_TERM_GAIN) for _, count in added.values()) for added in tried]
-    costs = [candidates.score(now | added) + own for added, own in zip(tried, prices, strict=True)]
-    best = tried[int(np.argmin(costs))]
+
+    def cost(added: Mapping[str, tuple[str, int]]) -> float:
+        price = sum(_price(count, LATE_TERM_GAIN) for _, count in added.values())
+        return candidates.score(now | dict(added)) + price
+
+    def with_fifth(added: Mapping[str, tuple[str, int]], count: int) -> dict[str, tuple[str, int]]:
+        return {**added, "xi_r4": ("chebyshev_log", count)}
+
+    # A lens has the fifth order with the same sign at all magnifications. What gains by a change of sign alone stands
+    # for functions that few magnifications leave too straight.
+    known = [
+        added
+        for added in tried
+        if added.get("xi_r4", ("", 0))[1] == 0
+        or cost(with_fifth(added, 1)) < cost(with_fifth(added, 0))
+    ]
+    best = min(known, key=cost)
     if not any(count for _, count in best.values()):
         return adjustment
     # Without coefficients there is no function.

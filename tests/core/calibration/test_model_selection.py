@@ -24,6 +24,7 @@ import pytest
 
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup, constant_functions
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
+from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.select import Candidates, Summary, select_functions
 from semcal_ros.core.camera.distortion import LATE_TERMS
@@ -126,6 +127,19 @@ def test_radial_distortion_of_the_fifth_order_is_found(
     clean = grid_views(truth, (350.0, 1400.0, 2800.0), noise_px=0.0, views=3, seed=9)
     # Some 30 coefficients from 20 views with 0.05 px of noise.
     assert fit_poses(clean, model.at, height_sigma_m=4e-5).rms_px() < 0.03
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_few_magnifications_are_not_followed_by_late_terms(seed: int) -> None:
+    """With a sign that changes, the fifth order gains 22 to 74 here, and 1.5 at most with the same sign everywhere."""
+    views = grid_views(
+        JSM.camera_at, (100.0, 400.0, 1500.0, 5000.0), noise_px=0.02, views=4, seed=seed
+    )
+    size, display = JSM.image_size, JSM.display_width_m
+    options = CalibrationOptions(residual="off")
+    model = calibrate_views(views, image_size=size, display_width_m=display, options=options).model
+    assert not [name for name in LATE_TERMS if name in model.functions]
 
 
 @pytest.mark.long
