@@ -620,11 +620,12 @@ def select(started: Start, residual: str) -> Selection:
         noisy, adjustment = _anneal(setup, noisy, more)
     if residual == "auto":
         adjustment, field, pattern = _add_field(noisy, adjustment, always=False)
-        if field is not None and more is not plain[1]:
-            # What the late terms stood for is a part of what the field describes, which has them among its patterns.
+        if field is not None and any(name in adjustment.functions for name in PRODUCTS):
+            # What the products stood for is a part of what the field describes, which has them among its patterns.
             # Where there is no solution without them, they stay.
             with suppress(UnusableCalibrationError):
-                instead = _add_field(*plain, always=True)
+                first = _add_terms(*plain, ("xi_r4",), SMOOTH)
+                instead = _add_field(plain[0], first, always=True)
                 if instead[1] is not None:
                     adjustment, field, pattern = instead
     return Selection(setup, adjustment, field, pattern, excess_px(setup, adjustment))

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semcal_ros.core.arrays import Array, Array32, Indices
-from semcal_ros.core.camera.distortion import LATE_TERMS, LENS_NAMES, distort_jacobians
+from semcal_ros.core.camera.distortion import LENS_NAMES, PRODUCTS, distort_jacobians
 from semcal_ros.core.camera.scan_distortion import scan_functions
 from semcal_ros.core.camera.thresholds import (
     FIELD_BREAKS_X,
@@ -308,9 +308,9 @@ class ResidualField:
         """Return (k, slice_size) inner products with the k patterns of the rest of the model.
 
         These are the shifts, the linear maps, the patterns of the distortion of the lens about the middle of the
-        picture, but for the :data:`~semcal_ros.core.camera.distortion.LATE_TERMS`, and those of the distortion of the
-        scan, each with a mean square of 1 over the domain. A field whose coefficients they annul leaves all of that to
-        the camera and to the poses. A camera with a field has no late terms.
+        picture, but for the products of both coordinates, and those of the distortion of the scan, each with a mean
+        square of 1 over the domain. A field whose coefficients they annul leaves all of that to the camera and to the
+        poses. A camera with a field has no products.
         """
         q, weight = _quadrature(self.knots_x, self.knots_y)
         x, y = q.T
@@ -319,7 +319,7 @@ class ResidualField:
         # A term of the lens that is small is its derivative.
         of_lens = np.moveaxis(distort_jacobians(q, 0.0, 0.0)[2], (2, 1), (0, 1))
         names = zip(LENS_NAMES, of_lens, strict=True)
-        patterns += [pattern for name, pattern in names if name not in LATE_TERMS]
+        patterns += [pattern for name, pattern in names if name not in PRODUCTS]
         patterns += [(along, zero) for along in scan_functions(x, 0)]
         patterns += [(zero, across) for across in scan_functions(y / np.max(np.abs(y)), 1)]
         basis = self.at(self.g_range[0]).basis(q) * weight[:, None]

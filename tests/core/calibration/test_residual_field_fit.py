@@ -214,22 +214,24 @@ def test_modes_and_methods_are_checked():
 
 
 @pytest.mark.parametrize("instead", ["unsolvable", "lost corners", "found"])
-def test_late_terms_stay_where_a_field_cannot_take_their_place(instead, monkeypatch):
+def test_products_stay_where_a_field_cannot_take_their_place(instead, monkeypatch):
     """By what the parts of a selection return: no microscope of the fleet has come to this."""
+    with_products = SimpleNamespace(functions={"xi_v": None})
 
     def add_field(setup, adjustment, *, always):
         if not always:
-            return "with late terms", "a field", None
+            return with_products, "a field", None
         if instead == "unsolvable":
             raise UnusableCalibrationError("equations of the residual field")
         return "plain", "a field" if instead == "found" else None, None
 
     monkeypatch.setattr(select, "select_and_adjust", lambda *_: "plain")
     monkeypatch.setattr(select, "_anneal", lambda _setup, noisy, adjustment: (noisy, adjustment))
-    monkeypatch.setattr(select, "add_late_terms", lambda *_: "late terms")
+    monkeypatch.setattr(select, "add_late_terms", lambda *_: with_products)
+    monkeypatch.setattr(select, "_add_terms", lambda *_: "plain")
     monkeypatch.setattr(select, "_add_field", add_field)
     monkeypatch.setattr(select, "excess_px", lambda *_: 0.0)
     started = SimpleNamespace(setup=None, tempered=None, functions=None, state=None, spread=None)
     found = select.select(started, "auto")
-    assert found.adjustment == ("plain" if instead == "found" else "with late terms")
+    assert found.adjustment == ("plain" if instead == "found" else with_products)
     assert found.field == "a field"

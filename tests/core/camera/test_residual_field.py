@@ -23,7 +23,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semcal_ros.core.camera.distortion import LATE_TERMS, LENS_NAMES
+from semcal_ros.core.camera.distortion import LENS_NAMES, PRODUCTS
 from semcal_ros.core.camera.residual_field import ResidualField, zero_field
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_distortion import SCAN_NAMES
@@ -115,8 +115,8 @@ def test_beyond_the_range_the_field_of_the_nearer_end_holds():
 def test_overlaps_are_the_integrals_that_they_say():
     field = _field(3)
     overlaps = field.overlaps()
-    # A camera with a field has no late terms.
-    scan = 6 + len(LENS_NAMES) - len(LATE_TERMS)
+    # A camera with a field has no products of both coordinates.
+    scan = 6 + len(LENS_NAMES) - len(PRODUCTS)
     assert overlaps.shape == (scan + len(SCAN_NAMES), field.slice_size)
     rows = overlaps @ field.at(1000.0).coefficients.ravel()
     # Gauss nodes, thirty between knots and the borders of the picture: there, fields and patterns are smooth.
@@ -149,6 +149,7 @@ def test_overlaps_are_the_integrals_that_they_say():
         (6 + LENS_NAMES.index("xi_t"), tangential, 1e-12),
         (6 + LENS_NAMES.index("xi_s"), spiral, 1e-12),
         (6 + LENS_NAMES.index("xi_u"), tangential * [1.0, -1.0], 1e-12),
+        (6 + LENS_NAMES.index("xi_r4") - len(PRODUCTS), r2[:, None] * radial, 1e-12),
         (scan + SCAN_NAMES.index("coil_x3"), np.stack([coil, zero], 1), 1e-8),
         # A decay is no polynomial, nor a coil one beyond the picture: six nodes in each cell are not quite exact.
         (scan + SCAN_NAMES.index("settling_3"), np.stack([decay - line, zero], 1), 1e-7),
