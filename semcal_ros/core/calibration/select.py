@@ -456,7 +456,7 @@ def add_late_terms(
     functions keep their numbers of coefficients while these are judged, and choose them again after it. The products
     are judged first: a centre far off, which takes their place, looks like the fifth order.
     """
-    for names in (PRODUCTS, LATE_TERMS):
+    for names in (PRODUCTS, ("xi_r4",)):
         adjustment = _add_terms(setup, adjustment, names, always)
     return adjustment
 
