@@ -172,16 +172,12 @@ def _echo_terms(described: dict[str, Any], camera: ScanCamera) -> None:
     if not has_terms(camera):
         return
     value, sigma, sizes = (described[k] for k in ("parameters", "parameter_sigma", "terms_px"))
-    if value["xi_r4"]:
-        click.echo(
-            f"xi_r4        {value['xi_r4']:.6g} +- {sigma['xi_r4']:.2g} "
-            f"(all radial {sizes['radial']:.2f} px at most)"
-        )
-    for name in ("xi_u", "xi_v", "xi_w"):
+    kinds = {"xi_r4": "radial", **dict.fromkeys(("xi_u", "xi_v", "xi_w"), "decentring")}
+    for name, kind in kinds.items():
         if value[name]:
             click.echo(
-                f"{name}         {value[name]:.6g} +- {sigma[name]:.2g} "
-                f"(all decentring {sizes['decentring']:.2f} px at most)"
+                f"{name:13}{value[name]:.6g} +- {sigma[name]:.2g} "
+                f"(all {kind} {sizes[kind]:.2f} px at most)"
             )
     if value["xi_s"]:
         click.echo(

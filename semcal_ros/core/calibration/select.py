@@ -482,19 +482,13 @@ def _add_terms(
         price = sum(_price(count, LATE_TERM_GAIN) for _, count in added.values())
         return candidates.score(now | dict(added)) + price
 
-    def with_fifth(added: Mapping[str, tuple[str, int]], count: int) -> dict[str, tuple[str, int]]:
-        return {**added, "xi_r4": ("chebyshev_log", count)}
-
+    none, *more = tried
     # A lens has the fifth order with the same sign at all magnifications. What gains by a change of sign alone stands
     # for functions that few magnifications leave too straight.
-    known = [
-        added
-        for added in tried
-        if added.get("xi_r4", ("", 0))[1] == 0
-        or cost(with_fifth(added, 1)) < cost(with_fifth(added, 0))
-    ]
-    best = min(known, key=cost)
-    if not any(count for _, count in best.values()):
+    if offered == ["xi_r4"] and cost(more[0]) >= cost(none):
+        return adjustment
+    best = min(tried, key=cost)
+    if best is none:
         return adjustment
     # Without coefficients there is no function.
     functions = refit_functions(functions, now | best)
