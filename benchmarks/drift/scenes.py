@@ -106,6 +106,17 @@ def sparse(rng: Rng) -> Floats:
     return 0.2 + _discs(rng, 40, (3.0, 6.0), (0.4, 0.8))
 
 
+def few(rng: Rng) -> Floats:
+    """Ten particles in the middle of what is seen, and none elsewhere."""
+    y, x = np.mgrid[:TORUS, :TORUS].astype(np.float64)
+    out = np.full((TORUS, TORUS), 0.3)
+    for _ in range(10):
+        px, py = 0.5 * TORUS + rng.uniform(-0.22, 0.22, 2) * SIZE
+        r, bright = rng.uniform(3.0, 7.0), rng.uniform(0.2, 0.5)
+        out += bright / (1.0 + np.exp(np.clip((np.hypot(x - px, y - py) - r) / 0.6, -50.0, 50.0)))
+    return out
+
+
 def lattice(rng: Rng, defects: int = 14) -> Floats:
     # Whole periods fit into the torus.
     m, n = int(rng.integers(50, 75)), int(rng.integers(4, 30))
@@ -304,6 +315,20 @@ def textured_tool(frame: Frame, k: int, rng: Rng) -> Frame:
     return Frame(picture, frame.shown * (1 - part))
 
 
+def tool_at_rest(frame: Frame, k: int, rng: Rng) -> Frame:
+    """A slender one, in sight from the first frame on, that does not move with the specimen."""
+    y, x = rng.uniform(100, 280), rng.uniform(0.62, 0.75) * SIZE
+    end = np.array([[SIZE + 20, y - 45], [x, y - 5], [x, y + 5], [SIZE + 20, y + 20]])
+    return _polygon(frame, end, 0.7, 0.05)
+
+
+def rolling(frame: Frame, k: int, rng: Rng) -> Frame:
+    """A ball in the middle, held in its place, that rolls off after a third of the frames."""
+    x, y = np.array([0.4, 0.35]) * SIZE + max(k - FRAMES // 3, 0) * np.array([3.0, 2.0])
+    a = np.linspace(0, 2 * np.pi, 60)
+    return _polygon(frame, np.stack([x + 18 * np.cos(a), y + 18 * np.sin(a)], axis=1), 0.8)
+
+
 def pushed(frame: Frame, k: int, rng: Rng) -> Frame:
     """A large particle that is pushed by a thin tip."""
     x, y = 120.0 + 3.0 * k, 190.0 + 8.0 * np.sin(k / 6.0)
@@ -463,6 +488,8 @@ KINDS: dict[str, Kind] = {
     "pushed particle": Kind(gold, pushed),
     "pushed over sparse": Kind(sparse, pushed),
     "gripper over sparse": Kind(sparse, gripper, electrons=15.0),
+    "tool at rest over few": Kind(few, tool_at_rest),
+    "ball over few": Kind(few, rolling),
     "shadow": Kind(gold, shadow),
     "data bar": Kind(gold, data_bar),
     "counter over powder": Kind(powder, counter_in_bar),

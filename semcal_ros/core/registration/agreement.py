@@ -31,10 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Mask, median, quantile
+from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.fractional_delay import gradients
 from semcal_ros.core.registration.inverse_compositional import TileStatistics
 from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_pixels, smooth
-from semcal_ros.core.registration.odd_bodies import find_odd_bodies
+from semcal_ros.core.registration.odd_bodies import OddBodies, bodies_at_edges, find_odd_bodies
 from semcal_ros.core.registration.thresholds import (
     AGREEMENT_SIGMAS,
     BESIDES_MAX,
@@ -113,6 +114,10 @@ class Agreement:
         (rows, cols) 0 to 1: what of the gradients of each tile is structure, whether it agrees or not.
     odd
         (rows, cols) the tiles of bodies that only differ from all others.
+    in_doubt
+        Whether what agrees may not be the specimen: one body has most of its structure, and others move otherwise.
+    is_one_of_several
+        Whether one body that ends in the image has most of the structure, beside others.
     """
 
     weights: Array
@@ -121,11 +126,14 @@ class Agreement:
     pull: float
     informs: Array
     odd: Mask
+    in_doubt: bool
+    is_one_of_several: bool
 
     @property
     def is_complete(self) -> bool:
         """Whether all of the image agrees: no body disagrees, even where the ground has no structure."""
         most = self.share > COMPLETE_SHARE_MIN and self.pull < 1.0 - COMPLETE_SHARE_MIN
+        most = most and not self.in_doubt
         return most and not np.any(keep_bodies(self.disagrees, BODY_TILES_MIN))
 
     @property
@@ -207,10 +215,10 @@ def find_agreement(
     disagrees = disagrees | _moves(
         tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
     )
-    found_odd = np.zeros_like(disagrees)
-    if looks_for_odd:
-        found_odd = _find_odd(tiles, np.where(disagrees, 0.0, own), louder, shared, odd)
-        disagrees = disagrees | found_odd
+    found = _find_odd(
+        tiles, own, disagrees, suspected, louder, shared, odd, looks_for_odd=looks_for_odd
+    )
+    disagrees = disagrees | found.tiles
     # By area: a bright tool has more of a gradient than all of the ground.
     share = float(weights[~disagrees].sum() / max(weights.sum(), 1e-30))
     # What is inside of a body moves with it, also where it shows nothing; its edge may run through the tiles around.
@@ -218,19 +226,51 @@ def find_agreement(
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * (tiles.gradient[..., 0, 0] + tiles.gradient[..., 1, 1])
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
-    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights, found_odd)
+    return Agreement(
+        np.where(left_out, 0.0, weights),
+        disagrees,
+        share,
+        pull,
+        weights,
+        found.tiles,
+        found.in_doubt,
+        found.is_one_of_several,
+    )
 
 
 def _find_odd(
-    tiles: TileStatistics, own: Array, noise: TileNoise, shared: float, before: Mask | None
-) -> Mask:
-    """The tiles of bodies that move otherwise than all others, of those whose gradients have a share ``own`` (rows,
-    cols) of structure.
+    tiles: TileStatistics,
+    own: Array,
+    disagrees: Mask,
+    suspected: Mask | None,
+    noise: TileNoise,
+    shared: float,
+    before: Mask | None,
+    *,
+    looks_for_odd: bool,
+) -> OddBodies:
+    """The bodies that move otherwise than all others, of those whose gradients have a share ``own`` (rows, cols) of
+    structure and which do not disagree already.
     """
-    gain = np.maximum(tiles.gain, 1e-6)
+    structure, gain = own > 0.0, np.maximum(tiles.gain, 1e-6)
+    informs, lost = structure & ~disagrees, structure & disagrees
+    if np.any(informs):
+        # What is not seen has no gain of its own.
+        gain = np.where(lost, median(gain[informs]), gain)
     left = shared * (gain**2 * noise.reference + noise.image)
     information, variances = (by[..., None, None] * tiles.gradient for by in (own * gain, left))
-    return find_odd_bodies(own > 0.0, information, -tiles.scores, variances, before)
+    if suspected is not None:
+        # What a tool covers has not moved.
+        lost &= ~grow_mask(bodies_at_edges(suspected), 1)
+    return find_odd_bodies(
+        informs,
+        information,
+        -tiles.scores,
+        variances,
+        before,
+        lost=lost,
+        looks_for_odd=looks_for_odd,
+    )
 
 
 def keep_bodies(disagrees: Mask, least: int) -> Mask:

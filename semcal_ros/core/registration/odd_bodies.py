@@ -21,7 +21,8 @@ doi:10.1016/0197-2456(86)90046-2), so that none of them outweighs the rest, and 
 all others by more than those do among themselves.
 
 It fails where less than five bodies lie apart from each other, as on a continuous ground, and where as many move in one
-way as in the other.
+way as in the other. Where two bodies or more move otherwise than one that outweighs them, or are not seen where it is,
+it says that either may be the specimen, unless that one reaches from edge to edge.
 """
 
 from __future__ import annotations
@@ -38,8 +39,31 @@ from semcal_ros.core.registration.thresholds import (
     ODD_BODIES_SPREAD_MIN,
     ODD_BODY_CHI2_MIN,
     ODD_BODY_STAYS,
+    SHEAR_OF_BODIES_PX,
     TELLING_SIGMA_PX_MAX,
+    TILE_SHIFT_PX_MAX,
+    WITNESSES_MIN,
 )
+
+
+@dataclass(frozen=True)
+class OddBodies:
+    """Which bodies move otherwise than all others.
+
+    Attributes
+    ----------
+    tiles
+        (rows, cols) True in the tiles of these.
+    in_doubt
+        Whether either of the others may be the specimen: a body that has more of the information than the rest, and
+        does not reach from edge to edge, or these.
+    is_one_of_several
+        Whether there is such a body, and others beside it, however they move.
+    """
+
+    tiles: Mask
+    in_doubt: bool
+    is_one_of_several: bool
 
 
 @dataclass(frozen=True)
@@ -55,10 +79,28 @@ class _Bodies:
         kept = np.arange(len(self.numbers)) != index
         return _Bodies(self.shifts[kept], self.covariances[kept], self.numbers[kept], self.labels)
 
+    @property
+    def precisions(self) -> Array:
+        """(n,) how well the shift of each is known, 1 / px^2."""
+        return np.asarray(1.0 / np.trace(self.covariances, axis1=1, axis2=2))
+
+    @property
+    def middles(self) -> Array:
+        """(n,) lines of their middles, in parts of the height."""
+        rows = len(self.labels)
+        return np.array([np.nonzero(self.labels == k)[0].mean() / rows for k in self.numbers])
+
 
 def find_odd_bodies(
-    informs: Mask, information: Array, pulls: Array, variances: Array, before: Mask | None = None
-) -> Mask:
+    informs: Mask,
+    information: Array,
+    pulls: Array,
+    variances: Array,
+    before: Mask | None = None,
+    *,
+    lost: Mask | None = None,
+    looks_for_odd: bool = True,
+) -> OddBodies:
     """Find the bodies of tiles that move otherwise than all others.
 
     Parameters
@@ -73,15 +115,20 @@ def find_odd_bodies(
     before
         (rows, cols) True in those that were odd at the shift before. They stay so unless they agree clearly, so that a
         shift that is refined step by step comes to an end.
+    lost
+        (rows, cols) True in tiles with structure that the image does not show at this shift; they do not inform.
+        ``information`` and ``variances`` are what they would have; none by default.
+    looks_for_odd
+        Whether any is to be found; if not, it is said whether there is doubt, alone.
 
     Returns
     -------
-    (rows, cols) True in the tiles of those bodies. One that has more of the information than all others is among them
-    only where it lies at an edge of the image, over which a tool comes in, and does not reach the opposite one.
+    Those bodies. One that has more of the information than all others is among them only where it lies at an edge of
+    the image, over which a tool comes in, and does not reach the opposite one.
     """
     odd = np.zeros(informs.shape, dtype=bool)
     bodies = _measure_bodies(informs, information, pulls, variances)
-    most = len(bodies.numbers) - ODD_BODIES_LEFT_MIN
+    most = len(bodies.numbers) - ODD_BODIES_LEFT_MIN if looks_for_odd else 0
     for _ in range(min(most, len(bodies.numbers) // 2)):
         limits = np.full(len(bodies.numbers), ODD_BODY_CHI2_MIN)
         if before is not None:
@@ -95,21 +142,82 @@ def find_odd_bodies(
         if chi2[index] < limits[index]:
             break
         body, rest = bodies.labels == bodies.numbers[index], bodies.without(index)
-        precisions = 1.0 / np.trace(bodies.covariances, axis1=1, axis2=2)
-        outweighs = precisions[index] > 0.5 * precisions.sum()
-        if (outweighs and not _may_come_in(body)) or not _are_spread(rest):
+        outweighs = bodies.precisions[index] > 0.5 * bodies.precisions.sum()
+        if outweighs and not _may_come_in(body):
+            break
+        if not _are_spread(rest) and not (outweighs and _are_inside(rest)):
             break
         odd |= body
         bodies = rest
-    return odd
+    missing = 0
+    if lost is not None and np.any(lost):
+        missing = _count_lost(informs | lost, lost, np.trace(information, axis1=2, axis2=3))
+    largest = _find_largest(bodies)
+    if largest is None:
+        return OddBodies(odd, in_doubt=False, is_one_of_several=False)
+    several = len(bodies.numbers) + missing > 1
+    return OddBodies(odd, _is_in_doubt(bodies, largest, missing), several)
+
+
+def _count_lost(structure: Mask, lost: Mask, information: Array) -> int:
+    """Number of bodies that are not seen, but for less than half of their ``information`` (rows, cols)."""
+    count, labels = cv2.connectedComponents(structure.astype(np.uint8), connectivity=8)
+    whole, missing = (
+        np.bincount(labels.ravel(), (information * part).ravel(), count)[1:]
+        for part in (structure, lost)
+    )
+    return int(np.count_nonzero(missing > 0.5 * whole))
+
+
+def _find_largest(bodies: _Bodies) -> int | None:
+    """The one of the bodies that outweighs all others and does not reach from edge to edge; None where none does."""
+    if not len(bodies.numbers):
+        return None
+    index = int(np.argmax(bodies.precisions))
+    if bodies.precisions[index] <= 0.5 * bodies.precisions.sum():
+        return None
+    return None if _reaches_across(bodies.labels == bodies.numbers[index]) else index
+
+
+def _is_in_doubt(bodies: _Bodies, index: int, missing: int) -> bool:
+    """Whether the bodies beside that of an index move alike, but otherwise than it, or as many as they are,
+    ``missing``, are not seen.
+
+    By as much as the drift may shear the image, and as tiles are off, they may differ.
+    """
+    rest = bodies.without(index)
+    others = len(rest.numbers)
+    if missing >= max(WITNESSES_MIN, others):
+        return True
+    if not others or others + missing < WITNESSES_MIN:
+        return False
+    if others > 1 and np.any(_compare_alike(rest) >= ODD_BODY_CHI2_MIN):
+        return False
+    weights = np.linalg.inv(rest.covariances)
+    of_mean = np.linalg.inv(weights.sum(axis=0))
+    off = bodies.shifts[index] - of_mean @ np.einsum("nij,nj->i", weights, rest.shifts)
+    apart = bodies.middles[index] - np.average(rest.middles, weights=rest.precisions)
+    allowed = TILE_SHIFT_PX_MAX**2 + (SHEAR_OF_BODIES_PX * apart) ** 2
+    covariance = bodies.covariances[index] + of_mean + allowed * np.eye(2)
+    return bool(off @ np.linalg.solve(covariance, off) >= ODD_BODY_CHI2_MIN)
+
+
+def bodies_at_edges(found: Mask) -> Mask:
+    """The bodies of a mask (rows, cols) that lie at an edge, over which a tool comes in."""
+    _, labels = cv2.connectedComponents(found.astype(np.uint8), connectivity=8)
+    at_edges = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    return np.asarray(np.isin(labels, at_edges[at_edges > 0]))
 
 
 def _may_come_in(body: Mask) -> bool:
     """Whether a body lies at an edge or a corner of the image, and ends in it: a ground may reach from edge to edge."""
-    top, bottom, left, right = (
-        np.any(side) for side in (body[0], body[-1], body[:, 0], body[:, -1])
-    )
-    return bool((top != bottom or left != right) and not (top and bottom) and not (left and right))
+    return bool(np.any(bodies_at_edges(body))) and not _reaches_across(body)
+
+
+def _reaches_across(body: Mask) -> bool:
+    """Whether a body lies at two opposite edges of the image."""
+    sides = ((body[0], body[-1]), (body[:, 0], body[:, -1]))
+    return any(bool(np.any(one) and np.any(other)) for one, other in sides)
 
 
 def _are_spread(bodies: _Bodies) -> bool:
@@ -117,6 +225,11 @@ def _are_spread(bodies: _Bodies) -> bool:
     found = np.isin(bodies.labels, bodies.numbers)
     extents = [np.ptp(np.flatnonzero(found.any(axis=axis))) + 1 for axis in (1, 0)]
     return bool(np.all(np.array(extents) >= ODD_BODIES_SPREAD_MIN * np.array(found.shape)))
+
+
+def _are_inside(bodies: _Bodies) -> bool:
+    """Whether none of the bodies lies at an edge, from where the parts of a tool come."""
+    return not np.any(bodies_at_edges(np.isin(bodies.labels, bodies.numbers)))
 
 
 def _measure_bodies(informs: Mask, information: Array, pulls: Array, variances: Array) -> _Bodies:

@@ -70,6 +70,7 @@ from semcal_ros.core.registration.specimen import (
     keep_specimen,
     look_at_whole,
     noise_beside_tools,
+    refuse_other_motions,
     refuse_unless_followed,
 )
 from semcal_ros.core.registration.thresholds import (
@@ -87,7 +88,6 @@ from semcal_ros.core.registration.thresholds import (
     SIGNAL_MIN,
     SIGNAL_SHARE_MIN,
     SIGNIFICANCE_MIN,
-    SPECIMEN_SHARE_MIN,
     TEXTURE_PX_MIN,
     WEAK_SIGNAL_MIN,
 )
@@ -504,9 +504,14 @@ def _register_across(
     rejection = find_failure(
         limits, peak, replace(alignment, covariance=sigma2 * np.eye(2)), correlation, 0.0
     )
-    if rejection is None and whole is not None and whole.share < SPECIMEN_SHARE_MIN:
-        reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
-        rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
+    if rejection is None and whole is not None:
+        rejection = refuse_other_motions(whole)
+        if rejection is None and whole.is_one_of_several:
+            # Lines run through an image. These are the edges of a thing, and what lies beside it tells both directions.
+            reason = (
+                "one direction is not determined: the lines end in the image, beside other bodies"
+            )
+            rejection = Rejection(MatchFailure.UNDETERMINED, reason)
     follow_px = limits.follow_px((np.shape(image)[1], np.shape(image)[0]), inside)
     if rejection is None and follow_px is not None:
         rejection = refuse_unless_followed(reference, alignment, image_noise, follow_px)
@@ -666,9 +671,8 @@ def _register(
         if kept is None and named is not rejection:
             suggested_px = np.array(peak.shift_px) + origin
         rejection = named
-    elif kept is None and whole is not None and whole.share < SPECIMEN_SHARE_MIN:
-        reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
-        rejection = Rejection(MatchFailure.AMBIGUOUS, reason)
+    elif kept is None and whole is not None:
+        rejection = refuse_other_motions(whole)
     if rejection is None:
         alignment, rejection = _allow_for_pull(alignment)
     moved = replace(

@@ -186,7 +186,7 @@ def keep_specimen(
             is_near = spread is not None and _is_near(tried, guess, spread)
             is_most = (
                 agreement.share > MAJORITY_SHARE and judge.share_of_new < 1.0 - SPECIMEN_SHARE_MIN
-            )
+            ) and not agreement.in_doubt
             if is_near and sigma < WELL_PREDICTED_PX and is_most:
                 # No other one can have as much, and no tool comes in so fast.
                 break
@@ -326,6 +326,24 @@ def _share_inside(
     return agreeing / max(float(weight.sum()), 1e-30)
 
 
+def refuse_other_motions(whole: Agreement) -> Rejection[MatchFailure] | None:
+    """Return why an image of which all is taken for the specimen is refused for what does not move with the rest; None
+    where nearly all does.
+    """
+    if whole.share < SPECIMEN_SHARE_MIN:
+        reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
+        return Rejection(MatchFailure.AMBIGUOUS, reason)
+    return _refuse_doubt() if whole.in_doubt else None
+
+
+def _refuse_doubt() -> Rejection[MatchFailure]:
+    return Rejection(
+        MatchFailure.AMBIGUOUS,
+        "ambiguous: one body has most of the structure, and others move otherwise; nothing says which of them are the "
+        "specimen",
+    )
+
+
 def _choose_hypothesis(
     reference: Reference, found: list[_Hypothesis], guess: Array, spread: Array | None
 ) -> _Hypothesis | Rejection[MatchFailure]:
@@ -337,10 +355,15 @@ def _choose_hypothesis(
     if spread is not None:
         near = [h for h in ordered if _is_near(h.alignment, guess, spread)]
         sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
-        if len(near) == 1 and sigma < PREDICTED_PX_MAX:
-            return _find_move(reference, near[0], ordered) or near[0]
+        if sigma < PREDICTED_PX_MAX:
+            moved = _find_move(reference, near[0], ordered) if len(near) == 1 else None
+            sure = [h for h in near if not h.agreement.in_doubt]
+            if moved is not None or len(sure) == 1:
+                return moved or sure[0]
     best = ordered[0]
     others = sum(h.agreement.share for h in ordered[1:])
+    if best.agreement.in_doubt:
+        return _refuse_doubt()
     if best.agreement.share > SPECIMEN_SHARE_MIN and others < 0.5 * best.agreement.share:
         return best
     return Rejection(

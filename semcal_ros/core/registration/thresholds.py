@@ -275,6 +275,15 @@ ODD_BODY_CHI2_MIN = TABLE.derived(
     "From which a body moves otherwise than all others: by chance one in 3000, exp(8), so that of twenty that all move "
     "alike, one is left out in one of 150 images.",
 )
+WITNESSES_MIN = TABLE.stated(
+    "WITNESSES_MIN", 2, "bodies",
+    "That move alike, and otherwise than one that outweighs them, so that either may be the specimen. One alone may be "
+    "a particle that is pushed over a plate.",
+)
+SHEAR_OF_BODIES_PX = TABLE.stated(
+    "SHEAR_OF_BODIES_PX", 0.5, "px over the height of the image",
+    "1-sigma by which a drift that has changed shears an image, so that bodies in different lines differ.",
+)
 ODD_BODY_STAYS = TABLE.stated(
     "ODD_BODY_STAYS", 0.5, "of ODD_BODY_CHI2_MIN",
     "From which one is that was so at the shift before: without it, such a shift may go to and fro between two, and is "
