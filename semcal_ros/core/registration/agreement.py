@@ -113,11 +113,7 @@ class Agreement:
     informs
         (rows, cols) 0 to 1: what of the gradients of each tile is structure, whether it agrees or not.
     odd
-        (rows, cols) the tiles of bodies that only differ from all others.
-    in_doubt
-        Whether what agrees may not be the specimen: one body has most of its structure, and others move otherwise.
-    is_one_of_several
-        Whether one body that ends in the image has most of the structure, beside others.
+        Bodies that only differ from all others, or may be the specimen as well as what agrees.
     """
 
     weights: Array
@@ -125,15 +121,13 @@ class Agreement:
     share: float
     pull: float
     informs: Array
-    odd: Mask
-    in_doubt: bool
-    is_one_of_several: bool
+    odd: OddBodies
 
     @property
     def is_complete(self) -> bool:
         """Whether all of the image agrees: no body disagrees, even where the ground has no structure."""
         most = self.share > COMPLETE_SHARE_MIN and self.pull < 1.0 - COMPLETE_SHARE_MIN
-        most = most and not self.in_doubt
+        most = most and not self.odd.in_doubt
         return most and not np.any(keep_bodies(self.disagrees, BODY_TILES_MIN))
 
     @property
@@ -226,16 +220,7 @@ def find_agreement(
     left_out = disagrees | (cv2.dilate(body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     energy = weights * (tiles.gradient[..., 0, 0] + tiles.gradient[..., 1, 1])
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
-    return Agreement(
-        np.where(left_out, 0.0, weights),
-        disagrees,
-        share,
-        pull,
-        weights,
-        found.tiles,
-        found.in_doubt,
-        found.is_one_of_several,
-    )
+    return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights, found)
 
 
 def _find_odd(

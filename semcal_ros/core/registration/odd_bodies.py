@@ -57,13 +57,16 @@ class OddBodies:
     in_doubt
         Whether either of the others may be the specimen: a body that has more of the information than the rest, and
         does not reach from edge to edge, or these.
-    is_one_of_several
-        Whether there is such a body, and others beside it, however they move.
+    largest
+        (rows, cols) True in the tiles of such a body, if there are others beside it, however they move.
+    others_px
+        (2,) shift of those others that tell one; NaN where none does.
     """
 
     tiles: Mask
     in_doubt: bool
-    is_one_of_several: bool
+    largest: Mask
+    others_px: Array
 
 
 @dataclass(frozen=True)
@@ -153,10 +156,15 @@ def find_odd_bodies(
     if lost is not None and np.any(lost):
         missing = _count_lost(informs | lost, lost, np.trace(information, axis1=2, axis2=3))
     largest = _find_largest(bodies)
-    if largest is None:
-        return OddBodies(odd, in_doubt=False, is_one_of_several=False)
-    several = len(bodies.numbers) + missing > 1
-    return OddBodies(odd, _is_in_doubt(bodies, largest, missing), several)
+    if largest is None or len(bodies.numbers) + missing < 2:
+        return OddBodies(odd, False, np.zeros_like(odd), np.full(2, np.nan))
+    rest = bodies.without(largest)
+    return OddBodies(
+        odd,
+        _is_in_doubt(bodies, largest, missing),
+        bodies.labels == bodies.numbers[largest],
+        _mean_shift(rest)[0] if len(rest.numbers) else np.full(2, np.nan),
+    )
 
 
 def _count_lost(structure: Mask, lost: Mask, information: Array) -> int:
@@ -193,13 +201,19 @@ def _is_in_doubt(bodies: _Bodies, index: int, missing: int) -> bool:
         return False
     if others > 1 and np.any(_compare_alike(rest) >= ODD_BODY_CHI2_MIN):
         return False
-    weights = np.linalg.inv(rest.covariances)
-    of_mean = np.linalg.inv(weights.sum(axis=0))
-    off = bodies.shifts[index] - of_mean @ np.einsum("nij,nj->i", weights, rest.shifts)
+    mean, of_mean = _mean_shift(rest)
+    off = bodies.shifts[index] - mean
     apart = bodies.middles[index] - np.average(rest.middles, weights=rest.precisions)
     allowed = TILE_SHIFT_PX_MAX**2 + (SHEAR_OF_BODIES_PX * apart) ** 2
     covariance = bodies.covariances[index] + of_mean + allowed * np.eye(2)
     return bool(off @ np.linalg.solve(covariance, off) >= ODD_BODY_CHI2_MIN)
+
+
+def _mean_shift(bodies: _Bodies) -> tuple[Array, Array]:
+    """(2,) weighted mean of the shifts of bodies, and its covariance (2, 2)."""
+    weights = np.linalg.inv(bodies.covariances)
+    covariance = np.linalg.inv(weights.sum(axis=0))
+    return covariance @ np.einsum("nij,nj->i", weights, bodies.shifts), covariance
 
 
 def bodies_at_edges(found: Mask) -> Mask:

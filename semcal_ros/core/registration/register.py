@@ -506,7 +506,7 @@ def _register_across(
     )
     if rejection is None and whole is not None:
         rejection = refuse_other_motions(whole)
-        if rejection is None and whole.is_one_of_several:
+        if rejection is None and np.any(whole.odd.largest):
             # Lines run through an image. These are the edges of a thing, and what lies beside it tells both directions.
             reason = (
                 "one direction is not determined: the lines end in the image, beside other bodies"

@@ -148,7 +148,8 @@ def keep_specimen(
         x, y = alignment.shift_px.tolist()
         starts.insert(0, replace(peak, shift_px=(x, y), step_px=peak.step_px))
     found: list[_Hypothesis] = []
-    for start in starts:
+    tries = [(start, suspected) for start in starts]
+    for start, moving in tries:
         if any(
             np.max(np.abs(np.subtract(start.shift_px, h.alignment.shift_px))) < SAME_SHIFT_PX
             for h in found
@@ -156,7 +157,7 @@ def keep_specimen(
             continue
         for looks_for_odd in (True, False):
             judge = _Judge(
-                reference, noise, suspected, np.array(start.shift_px), stretch_px, looks_for_odd
+                reference, noise, moving, np.array(start.shift_px), stretch_px, looks_for_odd
             )
             tried = align_reweighted(
                 level,
@@ -165,7 +166,7 @@ def keep_specimen(
                 judge.first(first),
                 noise.reference,
                 judge,
-                looks=suspected is None,
+                looks=moving is None,
             )
             agreement, is_one = judge.latest, False
             if not isinstance(tried, Rejection) and tried.converged:
@@ -180,13 +181,19 @@ def keep_specimen(
             np.max(np.abs(tried.shift_px - h.alignment.shift_px)) < SAME_SHIFT_PX for h in found
         ):
             found.append(_Hypothesis(tried, agreement, start, judge.suspected))
+            has_others = bool(np.all(np.isfinite(agreement.odd.others_px)))
+            if agreement.odd.in_doubt and has_others and moving is suspected:
+                # What the others show without the largest body.
+                x, y = (tried.shift_px + agreement.odd.others_px).tolist()
+                largest = _find_tiles(reference, tried, agreement.odd.largest)
+                tries.append((replace(start, shift_px=(x, y)), largest))
             if follow_px is not None:
                 # Another one may be that of the part that is the specimen.
                 continue
             is_near = spread is not None and _is_near(tried, guess, spread)
             is_most = (
                 agreement.share > MAJORITY_SHARE and judge.share_of_new < 1.0 - SPECIMEN_SHARE_MIN
-            ) and not agreement.in_doubt
+            ) and not agreement.odd.in_doubt
             if is_near and sigma < WELL_PREDICTED_PX and is_most:
                 # No other one can have as much, and no tool comes in so fast.
                 break
@@ -258,7 +265,7 @@ class _Judge:
         place = tiles.rows.start, tiles.cols.start, tiles.pixels.shape
         odd = None
         if self.latest is not None and place == self._place:
-            odd = self.latest.odd
+            odd = self.latest.odd.tiles
         self._place = place
         self.latest = find_agreement(
             tiles,
@@ -268,7 +275,7 @@ class _Judge:
             odd,
             looks_for_odd=self._looks_for_odd,
         )
-        self.found_odd |= bool(np.any(self.latest.odd))
+        self.found_odd |= bool(np.any(self.latest.odd.tiles))
         return self.latest.weights
 
     @property
@@ -333,7 +340,7 @@ def refuse_other_motions(whole: Agreement) -> Rejection[MatchFailure] | None:
     if whole.share < SPECIMEN_SHARE_MIN:
         reason = f"ambiguous: {100.0 * (1.0 - whole.share):.0f} % of the structure does not move with the rest"
         return Rejection(MatchFailure.AMBIGUOUS, reason)
-    return _refuse_doubt() if whole.in_doubt else None
+    return _refuse_doubt() if whole.odd.in_doubt else None
 
 
 def _refuse_doubt() -> Rejection[MatchFailure]:
@@ -357,12 +364,12 @@ def _choose_hypothesis(
         sigma = float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
         if sigma < PREDICTED_PX_MAX:
             moved = _find_move(reference, near[0], ordered) if len(near) == 1 else None
-            sure = [h for h in near if not h.agreement.in_doubt]
+            sure = [h for h in near if not h.agreement.odd.in_doubt]
             if moved is not None or len(sure) == 1:
                 return moved or sure[0]
     best = ordered[0]
     others = sum(h.agreement.share for h in ordered[1:])
-    if best.agreement.in_doubt:
+    if best.agreement.odd.in_doubt:
         return _refuse_doubt()
     if best.agreement.share > SPECIMEN_SHARE_MIN and others < 0.5 * best.agreement.share:
         return best
@@ -458,12 +465,16 @@ def find_moving(
     reference: Reference, alignment: Alignment, agreement: Agreement
 ) -> MovingTiles | None:
     """What does not agree with an alignment; None where all does."""
+    moving = _find_tiles(reference, alignment, agreement.disagrees)
+    return moving if moving.share > 0.0 else None
+
+
+def _find_tiles(reference: Reference, alignment: Alignment, tiles: Mask) -> MovingTiles:
+    """Tiles (rows, cols) that were compared, at their place in the image."""
     statistics = alignment.tile_statistics()
     assert statistics is not None
     side = np.array(reference.levels[-1].side, dtype=np.float64)
-    corner = _first_corner(reference, statistics, alignment)
-    moving = MovingTiles.of(agreement.disagrees, corner, side)
-    return moving if moving.share > 0.0 else None
+    return MovingTiles.of(tiles, _first_corner(reference, statistics, alignment), side)
 
 
 def _first_corner(reference: Reference, statistics: TileStatistics, alignment: Alignment) -> Array:
