@@ -57,6 +57,8 @@ SCENES = {
     "two tools": (4, (6, 7), 1.0),
     "rough tool": (2, (4, 5, 6, 7), 0.3),
     "pushed particle": (2, (4, 5, 6), 0.3),
+    "tool over sparse from the start": (0, (3, 5, 7, 9), 1.0),
+    "ball over few": (0, (2, 5, 7, 9), 1.0),
     "data bar": (0, (2, 4, 6, 8), 1.0),
 }
 SCENE_PX, FRAMES, SEED = 256, 10, 100
