@@ -59,7 +59,7 @@ from semcal_ros.core.calibration.judgement.outliers import (
     find_wrong_tilts,
     measure_deviations,
 )
-from semcal_ros.core.calibration.judgement.thresholds import TILT_SIGMAS
+from semcal_ros.core.calibration.judgement.thresholds import SURPRISING_SIGMAS, TILT_SIGMAS
 from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_model
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.paper.methods import fit_separately
@@ -174,7 +174,7 @@ def calibrate_views(
     failed: CalibrationError | None = None
     try:
         joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
-        contradiction = _find_contradicted_stage(views, setup)
+        contradiction = _find_contradicted_stage(views, setup) or _find_mirrored_beam(setup, joint)
         if not contradiction:
             joint, setup, told = _fit_without_window_bias(joint, setup, options, on_stage)
             notes += [*told, *_find_turned_axis(views, setup, joint), *lines]
@@ -590,6 +590,23 @@ def _find_contradicted_stage(given: Sequence[GridView], setup: Setup) -> list[Fi
     return [
         Finding(
             f"scale: {refused} of {counted(len(told), 'view')} contradict the tilt of the stage: {_UNUSED_STAGE}"
+        )
+    ]
+
+
+def _find_mirrored_beam(setup: Setup, fit: JointFit) -> list[Finding]:
+    """Return a finding if tilts of the stage make the perspective that of a beam that spreads upwards."""
+    functions, lowest = fit.padded.functions, float(setup.magnifications[0])
+    if functions["rho"](lowest) >= 0.0 or not any(v.has_stage_tilt for v in setup.views):
+        return []
+    field = None if fit.field is None else fit.field.field
+    camera = make_model(setup, functions, fit.covariance, "joint", field).at(lowest)
+    assert camera.covariance is not None
+    if camera.rho >= -SURPRISING_SIGMAS * np.sqrt(camera.covariance[5, 5]):
+        return []
+    return [
+        Finding(
+            f"scale: with the tilts of the stage, the images look as if the beam spread upwards: {_UNUSED_STAGE}"
         )
     ]
 

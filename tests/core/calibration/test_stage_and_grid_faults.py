@@ -28,6 +28,7 @@ import pytest
 
 from semcal_ros.core.calibration import pipeline
 from semcal_ros.core.calibration.judgement.findings import find_weaknesses
+from semcal_ros.core.calibration.judgement.outliers import measure_deviations
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
 from semcal_ros.core.calibration.stage import StageAxis, StageReading
@@ -379,6 +380,55 @@ def test_a_fit_that_fails_with_the_stage_is_made_without_it(monkeypatch, is_cure
     (note,) = (note for note in scale_notes(result) if "the stage is not used" in note)
     assert "with the tilts of the stage there is a fit at no minimum" in note
     assert not any(view.has_stage_tilt for view in result.views)
+
+
+def test_a_stage_with_the_wrong_sign_makes_no_mirrored_microscope():
+    """Tilts the other way round, and a beam that spreads upwards, explain the views as well as the truth does."""
+    views = stage_views(
+        MICROSCOPE.camera_at,
+        (100.0, 200.0, 400.0),
+        ONE_AXIS,
+        readings=True,
+        most_corners=60,
+        seed=1,
+    )
+    wrong = [replace(v, stage=replace(v.stage, tilt_rad=-v.stage.tilt_rad)) for v in views]
+    result = calibrated(wrong, axis=StageAxis(0.2))
+    assert not any(view.has_stage_tilt for view in result.views)
+    camera, truth = result.model.at(150.0), MICROSCOPE.camera_at(150.0)
+    assert abs(camera.rho - truth.rho) < 4.0 * np.sqrt(camera.covariance[5, 5])
+    notes = [note for note in scale_notes(result) if "tilts of the stage" in note]
+    assert len(notes) == 2
+    assert "as if the beam spread upwards: the stage is not used" in notes[0]
+    assert "add 180 to stage.tilt_axis_deg" in notes[1]
+    # Where nothing else tells the camera, there is none.
+    few = [v for v in wrong if v.magnification == 100.0][1:]
+    with pytest.raises(CalibrationError, match="contradict the tilt of the stage"):
+        calibrated(few, axis=StageAxis(0.2))
+
+
+def test_a_height_is_where_the_plane_crosses_the_beam():
+    """Lattices are counted from the middle of the picture, and the beam is 57 px beside it: at 60x, 160 um."""
+    stage = replace(ANY_WAY, height_sigma_m=0.0, visit_height_sigma_m=0.0)
+
+    def camera_at(magnification):
+        camera = MICROSCOPE.camera_at(magnification)
+        return replace(camera, px=camera.px + 40.0, py=camera.py - 40.0)
+
+    views = [
+        replace(view, board_xy_m=view.board_xy_m - view.board_xy_m.mean(axis=0))
+        for view in stage_views(
+            camera_at, (60.0, 200.0, 700.0, 2500.0), stage, most_corners=60, seed=1
+        )
+    ]
+    setup = pipeline.prepare(
+        views, image_size=MICROSCOPE.image_size, display_width_m=MICROSCOPE.display_width_m
+    )
+    adjusted = pipeline.fit_joint(setup, "off").adjustment
+    found = measure_deviations(adjusted.problem, adjusted.result)
+    # A principal point that is known to some 3 px makes 10 um; by the origins of the lattices, they differ by 130.
+    assert np.max(np.abs(found.height_m)) < 2e-5
+    assert np.max(found.of_limit) < 0.5
 
 
 @pytest.mark.slow

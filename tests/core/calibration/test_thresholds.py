@@ -76,6 +76,7 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
         (1.0 - math.cos(t.LINES_TILT_MAX_RAD), 1.5e-4, 5e-6),
         (stats.norm.cdf(1.0), t.ONE_SIGMA, 1e-12),
         (5.0 / 108.0, judgement.EMPTY_PART, 0.005),
+        (stats.norm.ppf(0.5 + 0.5 * judgement.VIEW_PART), judgement.VIEW_PART_SIGMAS, 1e-5),
         (np.ptp(judgement.PLANNED_DIRECTIONS_RAD), 2.0 / 3.0 * math.pi, 1e-12),
     ],
 )

@@ -309,6 +309,24 @@ def test_a_pattern_in_the_residuals_is_found_and_noise_is_not(result: Calibratio
     assert any("pattern over the field" in f for f in collect_warnings(spiral))
 
 
+def test_single_corners_that_are_far_off_are_no_pattern_and_no_bad_view(
+    result: CalibrationResult,
+) -> None:
+    """One in a hundred, by 1.5 px: the adjustment bears them."""
+    rng = np.random.default_rng(5)
+    off = []
+    for own in result.fit.residuals_px:
+        wrong = rng.uniform(size=len(own)) < 0.01
+        directions = rng.normal(size=own.shape)
+        directions *= 1.5 / np.linalg.norm(directions, axis=1, keepdims=True)
+        off.append(np.where(wrong[:, None], directions, own))
+    spoiled = replace(result, fit=replace(result.fit, residuals_px=tuple(off)))
+    assert sum(int(np.sum(a != b)) for a, b in zip(off, result.fit.residuals_px, strict=True)) > 20
+    assert estimate_pattern_px(spoiled)[1] < 2.0
+    said = set(collect_warnings(spoiled)) - set(collect_warnings(result))
+    assert not any("pattern over the field" in text or "corners of" in text for text in said)
+
+
 def test_many_rejected_views_are_a_finding_with_the_commonest_reason(
     result: CalibrationResult,
 ) -> None:

@@ -67,13 +67,20 @@ class Residual:
     by: Mapping[str, Array]
 
 
-def height_residual(problem: Problem, state: State) -> Residual:
-    """The specimen's plane crosses the beam at the height of its visit, but for what a tilt of the stage changes."""
+def heights_on_beam(problem: Problem, state: State) -> tuple[Array, Array, Array]:
+    """Return (V,) heights at which the specimen's plane crosses the beam, without what a tilt of the stage changes, and
+    their derivatives by pose and axis (:func:`.stage.height_of_tilt`).
+    """
     scan = np.zeros(len(problem.group))
     if problem.attitudes is not None:
         scan = problem.attitudes.scan_rotation_rad
     miss = problem.shared_values(state.theta, MISS_NAMES)
-    height, by_pose, by_miss = height_of_tilt(scan, state.rotations, state.translations_m, miss)
+    return height_of_tilt(scan, state.rotations, state.translations_m, miss)
+
+
+def height_residual(problem: Problem, state: State) -> Residual:
+    """The specimen's plane crosses the beam at the height of its visit, but for what a tilt of the stage changes."""
+    height, by_pose, by_miss = heights_on_beam(problem, state)
     if problem.effects is not None:
         height = height - state.visits[problem.effects.visit, 1]
     precision = 1.0 / problem.height_sigma_m[:, None, None]

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices, mad_sigma
-from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD, NAMED_MAX
+from semcal_ros.core.arrays import Array, Indices, mad_sigma, quantile
+from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD, HUBER_SIGMAS, NAMED_MAX
 from semcal_ros.core.calibration.judge import CalibrationResult
 from semcal_ros.core.calibration.judgement.evaluate import rms_by_magnification
 from semcal_ros.core.calibration.judgement.thresholds import (
@@ -33,10 +33,12 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     EMPTY_PART,
     FILLED_PART,
     HELD_OUT_RATIO,
-    NEXT_SIGMA_PX,
+    NEXT_SIGMA,
     PATTERN_PX,
     PATTERN_RATIO,
     REJECTED_PART,
+    VIEW_PART,
+    VIEW_PART_SIGMAS,
     VIEW_RATIO,
 )
 from semcal_ros.core.calibration.method_fit import Finding, rank_findings
@@ -44,6 +46,7 @@ from semcal_ros.core.calibration.views import FoundView, RejectedView, show_line
 from semcal_ros.core.camera.uncertainty import make_field_lattice, predict_shape_sigma_px
 from semcal_ros.core.corners import LatticeDetection
 from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.robust_losses import huber_weight
 from semcal_ros.core.wording import counted
 
 
@@ -179,10 +182,15 @@ def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     """Estimate the size in px of a pattern in the residuals, and its ratio to chance.
 
     The ratio compares the squares of the cells' weighted mean residuals with what independent
-    corners of the same spread would give; 1 is pure chance.
+    corners of the same spread would give; 1 is pure chance. Single corners that are far off count as
+    little as in the adjustment (Huber).
     """
     xy, residuals = concatenate_corners(result)
     weights = np.concatenate([v.sigma_px for v in result.views]) ** -2.0
+    normalised = normalise_residuals(result)
+    spread = mad_sigma(normalised)
+    norm = np.linalg.norm(normalised, axis=1) / max(spread, 1e-30)
+    weights = weights * huber_weight(norm, HUBER_SIGMAS)
     cells = assign_cells(result, xy, COVERAGE_CELLS)
     size = cells.columns * cells.rows
     enough = cells.counts >= CELL_CORNERS_MIN
@@ -192,7 +200,6 @@ def estimate_pattern_px(result: CalibrationResult) -> tuple[float, float]:
     sums = np.stack(
         [np.bincount(cells.index, weights * residuals[:, k], size)[enough] for k in (0, 1)], axis=1
     )
-    spread = mad_sigma(normalise_residuals(result))
     chance = spread**2 / total
     squares = np.sum((sums / total[:, None]) ** 2, axis=1)
     expected = result.views[0].dimensions * chance
@@ -248,10 +255,11 @@ def _check_views(result: CalibrationResult, rejected: Sequence[RejectedView]) ->
         )
     bad = []
     for view, residuals in zip(result.views, result.fit.residuals_px, strict=True):
-        rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        ratio = rms / view.expected_rms_px
+        own = np.abs(view.known_residuals(residuals) / view.sigma_px[:, None])
+        # Single corners that are far off do no harm.
+        ratio = quantile(own, VIEW_PART) / VIEW_PART_SIGMAS
         if ratio > VIEW_RATIO:
-            bad.append((ratio, rms, view))
+            bad.append((ratio, ratio * view.expected_rms_px, view))
     if bad:
         bad.sort(key=lambda item: -item[0])
         _, worst_px, worst = max(bad, key=lambda item: item[1])
@@ -350,7 +358,7 @@ def _check_predicted_error(result: CalibrationResult) -> list[Finding]:
     except (InvalidValueError, ValueError):
         return []
     g = max(worst, key=lambda x: worst[x])
-    if worst[g] > NEXT_SIGMA_PX:
+    if worst[g] > NEXT_SIGMA * model.image_size[0]:
         return [
             Finding(
                 f"around {float(f'{g:.2g}'):.10g}x positions at the edge of the image are uncertain "

@@ -40,7 +40,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     variance_factor,
 )
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup
-from semcal_ros.core.calibration.estimator.residuals import whitened_norm
+from semcal_ros.core.calibration.estimator.residuals import heights_on_beam, whitened_norm
 from semcal_ros.core.calibration.estimator.thresholds import FLAT_RAD
 from semcal_ros.core.calibration.judgement.thresholds import (
     DETERMINED_MIN,
@@ -311,11 +311,13 @@ def measure_deviations(
     tilted = result.state.rotations[:, 2, 2] <= np.cos(FLAT_RAD)
     lattices = np.abs(result.state.lattices)
     stretch = np.max(lattices, axis=1) if len(lattices) else np.zeros(count)
+    # The origin of a tilted lattice lies higher the farther it is from the beam.
+    on_beam, _, _ = heights_on_beam(problem, result.state)
     height, others = np.zeros(count), np.zeros(count)
     of_limit = np.zeros(count)
     for v in range(count):
         rest = np.arange(count) != v
-        heights, from_views = _heights_without(problem, result.state.translations_m[:, 2], v)
+        heights, from_views = _heights_without(problem, on_beam, v)
         like = heights[rest & (tilted | ~tilted[v])]
         limit, others[v] = _limit(like, from_views, count, usual_height_m, HEIGHT_SPREAD_MIN_M)
         height[v] = heights[v]

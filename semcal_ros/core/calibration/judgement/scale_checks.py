@@ -116,7 +116,7 @@ def _tilts_span_one_direction(rotations: Array) -> bool:
     return bool(values[0] < ONE_DIRECTION * values[1])
 
 
-def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> list[Finding]:
+def _find_stage_errors(setup: Setup, fit: JointFit) -> list[Finding]:
     """List what the readings of the stage and the images do not agree on.
 
     A constant error is estimated and so costs nothing by itself; what a configuration that is wrong costs is not known.
@@ -146,15 +146,6 @@ def _find_stage_errors(setup: Setup, fit: JointFit, model: CalibrationModel) -> 
                     "the configuration says: check stage.tilt_axis_deg and the unit of the readings"
                 )
             )
-    camera = model.at(float(setup.magnifications[0]))
-    assert camera.covariance is not None
-    if camera.rho < -SURPRISING_SIGMAS * np.sqrt(camera.covariance[5, 5]):
-        out.append(
-            Finding(
-                "scale: the images look as if the beam diverged upwards, so the tilts of the stage have "
-                "the wrong sign: add 180 to stage.tilt_axis_deg"
-            )
-        )
     return out
 
 
@@ -242,7 +233,7 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
                 magnification=where,
             )
         )
-    out += _find_stage_errors(setup, fit, model)
+    out += _find_stage_errors(setup, fit)
     out += _find_unusual_scan(setup, model)
     remedy = (
         "add views with the grating turned to other directions"
@@ -264,14 +255,17 @@ def find_scale_weaknesses(setup: Setup, fit: JointFit, model: CalibrationModel) 
             )
         )
     if setup.shared and not _is_repeatability_known(fit):
-        presumed = estimate_repeatability(setup, fit)
+        sigma = estimate_repeatability(setup, fit)
         groups = setup.visits[1]
         which = "more" if len(np.unique(groups)) < len(groups) else "some"
+        why = f"{100.0 * sigma:.2g} % is presumed"
+        if sigma > setup.priors.visit_scale_sigma:
+            why = f"{100.0 * sigma:.2g} % is seen, of which all may be a course of the scale that is not smooth"
         out.append(
             Finding(
-                "scale: the views do not show how repeatable the magnification is; "
-                f"{100.0 * presumed:.2g} % is presumed. Visit {which} magnifications twice",
-                cost_relative=presumed,
+                f"scale: the views do not show how repeatable the magnification is; {why}. Visit {which} "
+                "magnifications twice",
+                cost_relative=sigma,
             )
         )
     if fit.pattern is not None:

@@ -120,9 +120,17 @@ REJECTED_PART = TABLE.stated(
     "More rejected ones are no accident: something is wrong with the recording.",
 )
 VIEW_RATIO = TABLE.stated(
-    "VIEW_RATIO", 3.0, "ratio of RMS",
+    "VIEW_RATIO", 3.0, "ratio of spreads",
     "Of a view's residuals to what the 1-sigma of its corners predicts, above which it is named. Corners do not "
     "scatter as much by chance; what they have in common does.",
+)
+VIEW_PART = TABLE.stated(
+    "VIEW_PART", 0.75, "of the residuals",
+    "Whose largest is a view's spread. A quarter may be far off: the adjustment bears them.",
+)
+VIEW_PART_SIGMAS = TABLE.derived(
+    "VIEW_PART_SIGMAS", 1.15035, "sigma",
+    "Of which as many normal residuals are smaller: the quantile of the normal distribution at (1 + VIEW_PART) / 2.",
 )
 PATTERN_RATIO = TABLE.stated(
     "PATTERN_RATIO", 3.0, "ratio of squares",
@@ -132,9 +140,9 @@ PATTERN_PX = TABLE.stated(
     "PATTERN_PX", 0.02, "px",
     "RMS of a pattern: a smaller one may be significant, but does not matter.",
 )
-NEXT_SIGMA_PX = TABLE.stated(
-    "NEXT_SIGMA_PX", 2.0, "px",
-    "Predicted error, between two calibrated magnifications or at one, beyond which more images help.",
+NEXT_SIGMA = TABLE.stated(
+    "NEXT_SIGMA", 0.004, "of the width of the image",
+    "Predicted error, between two calibrated magnifications or at one, beyond which more images help: 2 px of 512.",
 )
 
 # Outliers, in outliers.py
