@@ -680,7 +680,8 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
 
     Where the projection is parallel, one view at a wrong scale is imitated by a tilt of a stretched grid, so
     all views are given stretched grids, and that view stands out little. Leaving it out makes the stretch of the
-    others collapse, which leaving out another does not.
+    others collapse, which leaving out another does not. Its own is beyond doubt: where hardly any is determined, their
+    spread may be large by chance.
     """
     lattice = fit.adjustment.spread.lattice_sigma
     if lattice is None or not _is_irregular(setup, fit):
@@ -689,10 +690,13 @@ def _find_masked_outlier(setup: Setup, fit: JointFit) -> Mapping[int, Rejection[
         fit.adjustment.problem, fit.adjustment.result, setup.priors.height_sigma_m
     )
     count = {g: sum(v.magnification == g for v in setup.views) for g in setup.magnifications}
+    result = fit.adjustment.result
+    sigmas = lattice * np.sqrt(result.prior_variance["lattice"])
+    is_sure = np.max(np.abs(result.state.lattices) / sigmas, axis=1) > SURPRISING_SIGMAS
     suspects = [
         int(v)
         for v in np.argsort(-deviations.of_limit)[:SUSPECTS_MAX]
-        if count[setup.views[int(v)].magnification] > 2
+        if count[setup.views[int(v)].magnification] > 2 and is_sure[v]
     ]
     left = {}
     # The field is that of all views: one of them hardly changes it.

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from semcal_ros.core.calibration import pipeline
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import Adjustment, BundleResult
 from semcal_ros.core.calibration.estimator.problem import Priors, Setup
@@ -80,6 +81,26 @@ def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):
         clean = calibrate_views([v for i, v in enumerate(views) if i != wrong], **OPTIONS)
         for g in (500.0, 2600.0, 8000.0):
             np.testing.assert_allclose(result.model.at(g).m, clean.model.at(g).m, rtol=1e-6)
+
+
+def test_a_view_whose_own_grid_is_not_known_to_be_stretched_is_not_left_out_for_it(monkeypatch):
+    """The spread of the grids may be large by chance, and fall without any one of the views."""
+    views = seen_views("parallel", (1000.0, 2000.0, 4000.0))
+    given = {key: OPTIONS[key] for key in ("image_size", "display_width_m")}
+    setup = pipeline.prepare(views, **given)
+    fit = pipeline.fit_joint(setup, "off")
+    adjustment = fit.adjustment
+    collapsed = replace(adjustment.spread, lattice_sigma=1e-3 * adjustment.spread.lattice_sigma)
+    without = replace(fit, adjustment=replace(adjustment, spread=collapsed))
+    monkeypatch.setattr(pipeline, "_is_irregular", lambda _setup, _fit: True)
+    monkeypatch.setattr(pipeline, "fit_joint", lambda _setup, _residual: without)
+    assert pipeline._find_masked_outlier(setup, fit) == {}
+    # One that is, is.
+    lattices = np.zeros_like(adjustment.result.state.lattices)
+    lattices[4] = 0.03
+    state = replace(adjustment.result.state, lattices=lattices)
+    stretched = replace(adjustment, result=replace(adjustment.result, state=state))
+    assert list(pipeline._find_masked_outlier(setup, replace(fit, adjustment=stretched))) == [4]
 
 
 @pytest.mark.long
