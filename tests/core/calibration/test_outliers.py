@@ -59,11 +59,13 @@ def _misnamed(views, index, factor):
 
 
 # Under a parallel projection, tilts of a stretched grid imitate the wrong scale; of the last view best of all.
+# These planes are tilted about the middle of the grid, so that they cross the beam up to 0.1 mm higher or lower: of the
+# 8 mm to the pivot, 6 % stand out just as much as is allowed beside that.
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "factor", "wrong"),
     [
-        ("strong_perspective", 1.06, 10),
+        ("strong_perspective", 1.07, 10),
         ("parallel", 0.94, 10),
         ("parallel", 1.06, 11),
     ],
