@@ -27,7 +27,7 @@ it says that either may be the specimen, unless that one reaches from edge to ed
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -225,7 +225,12 @@ def bodies_at_edges(found: Mask) -> Mask:
 
 def _may_come_in(body: Mask) -> bool:
     """Whether a body lies at an edge or a corner of the image, and ends in it: a ground may reach from edge to edge."""
-    return bool(np.any(bodies_at_edges(body))) and not _reaches_across(body)
+    return _lies_at_edge(body) and not _reaches_across(body)
+
+
+def _lies_at_edge(found: Mask) -> bool:
+    """Whether any of a mask (rows, cols) lies at an edge of the image."""
+    return bool(np.any(found[[0, -1]]) or np.any(found[:, [0, -1]]))
 
 
 def _reaches_across(body: Mask) -> bool:
@@ -243,7 +248,7 @@ def _are_spread(bodies: _Bodies) -> bool:
 
 def _are_inside(bodies: _Bodies) -> bool:
     """Whether none of the bodies lies at an edge, from where the parts of a tool come."""
-    return not np.any(bodies_at_edges(np.isin(bodies.labels, bodies.numbers)))
+    return not _lies_at_edge(np.isin(bodies.labels, bodies.numbers))
 
 
 def _measure_bodies(informs: Mask, information: Array, pulls: Array, variances: Array) -> _Bodies:
@@ -296,8 +301,6 @@ def _compare_one(bodies: _Bodies, index: int) -> float:
     squared = (precisions @ precisions).sum(axis=0)
     scale = np.trace(information) - np.trace(np.linalg.solve(information, squared))
     spread = np.eye(2) * max(0.0, (chi2 - freedom) / float(scale))
-    weights = np.linalg.inv(others.covariances + spread)
-    of_mean = np.linalg.inv(weights.sum(axis=0))
-    mean = of_mean @ np.einsum("nij,nj->i", weights, others.shifts)
+    mean, of_mean = _mean_shift(replace(others, covariances=others.covariances + spread))
     off = bodies.shifts[index] - mean
     return float(off @ np.linalg.solve(bodies.covariances[index] + spread + of_mean, off))

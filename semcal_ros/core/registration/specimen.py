@@ -149,7 +149,7 @@ def keep_specimen(
         starts.insert(0, replace(peak, shift_px=(x, y), step_px=peak.step_px))
     found: list[_Hypothesis] = []
     tries = [(start, suspected) for start in starts]
-    for start, moving in tries:
+    for start, known in tries:
         if any(
             np.max(np.abs(np.subtract(start.shift_px, h.alignment.shift_px))) < SAME_SHIFT_PX
             for h in found
@@ -157,7 +157,7 @@ def keep_specimen(
             continue
         for looks_for_odd in (True, False):
             judge = _Judge(
-                reference, noise, moving, np.array(start.shift_px), stretch_px, looks_for_odd
+                reference, noise, known, np.array(start.shift_px), stretch_px, looks_for_odd
             )
             tried = align_reweighted(
                 level,
@@ -166,7 +166,7 @@ def keep_specimen(
                 judge.first(first),
                 noise.reference,
                 judge,
-                looks=moving is None,
+                looks=known is None,
             )
             agreement, is_one = judge.latest, False
             if not isinstance(tried, Rejection) and tried.converged:
@@ -182,7 +182,7 @@ def keep_specimen(
         ):
             found.append(_Hypothesis(tried, agreement, start, judge.suspected))
             has_others = bool(np.all(np.isfinite(agreement.odd.others_px)))
-            if agreement.odd.in_doubt and has_others and moving is suspected:
+            if agreement.odd.in_doubt and has_others and known is suspected:
                 # What the others show without the largest body.
                 x, y = (tried.shift_px + agreement.odd.others_px).tolist()
                 largest = _find_tiles(reference, tried, agreement.odd.largest)
