@@ -181,6 +181,13 @@ def test_a_scale_that_bends_between_few_magnifications_is_not_suspected():
     assert not any("jump" in w or "departs by" in w for w in result.warnings)
 
 
+def _further(smooth):
+    """The next two Chebyshev polynomials, as far as they leave a degree of freedom."""
+    count, order = smooth.shape
+    more = np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, count), order + 1)
+    return more[:, order : min(order + 2, count - 1)]
+
+
 def _draw_scales(rng, scatter, step=0.0, visits=1, order=5):
     """Scales in per cent of a wave over up to 15 magnifications, of visits that scatter as nobody knows."""
     count = int(rng.integers(5, 16))
@@ -211,7 +218,7 @@ def test_scales_that_do_not_jump_are_rarely_said_to(scatter, visits):
     found = 0
     for _ in range(1000):
         scales, smooth, candidates, _ = _draw_scales(rng, scatter, visits=visits)
-        found += find_change(scales, smooth, candidates) is not None
+        found += find_change(scales, smooth, candidates, _further(smooth)) is not None
     assert found <= 10 + 3 * 3
 
 
@@ -220,9 +227,24 @@ def test_a_step_is_found_where_it_is_and_its_sigma_is_right():
     deviations, right, drawn = [], 0, 200
     for _ in range(drawn):
         scales, smooth, candidates, at = _draw_scales(rng, 0.1, step=3.0, visits=2, order=2)
-        found = find_change(scales, smooth, candidates)
+        found = find_change(scales, smooth, candidates, _further(smooth))
         if found is not None and np.array_equal(candidates[found[0]], np.arange(len(smooth)) >= at):
             right += 1
             deviations.append((found[1] - 3.0) / found[2])
     assert right > 0.9 * drawn
     assert 0.8 < np.sqrt(np.mean(np.square(deviations))) < 1.2
+
+
+def test_a_wave_that_the_chosen_function_does_not_follow_is_no_jump():
+    """What is left of a smooth course does not scatter, and a step stands for it as well as further orders do."""
+    rng = np.random.default_rng(9)
+    told = {False: 0, True: 0}
+    for _ in range(300):
+        scales, smooth, candidates, _ = _draw_scales(rng, 0.1, visits=2, order=3)
+        further = _further(smooth)
+        wave = 3.0 * further @ rng.normal(size=further.shape[1])
+        bent = replace(scales, departure=scales.departure + wave)
+        for knows in told:
+            more = further if knows else further[:, :0]
+            told[knows] += find_change(bent, smooth, candidates, more) is not None
+    assert told[True] <= 0.02 * 300 < 0.2 * 300 < told[False]

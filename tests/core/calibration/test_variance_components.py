@@ -22,9 +22,15 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.problem import Spread, VarianceComponents
+from semcal_ros.core.calibration.estimator.problem import (
+    Priors,
+    Spread,
+    VarianceComponents,
+    usual_lattice_sigmas,
+)
 from semcal_ros.core.calibration.estimator.variance_components import (
     _drift_sigma,
+    _lattice_sigma,
     accelerate_components,
     largest_change,
 )
@@ -112,3 +118,31 @@ def test_updates_that_lead_far_away_are_not_extrapolated() -> None:
     assert largest_change(accelerate_components([(first, second), (second, third)]), third) == 0.0
     # Nor is a single one.
     assert largest_change(accelerate_components([(first, second)]), second) == 0.0
+
+
+def lattice_spread(true: float, known: float, rng: np.random.Generator) -> float:
+    """The spread of stretches, over the usual one, that 60 views tell of, each known to ``known`` usual spreads."""
+    usual = usual_lattice_sigmas(Priors())
+    seen = usual * np.hypot(true, known) * rng.normal(size=(60, 2))
+    sigma = usual.copy()
+    for _ in range(200):
+        left = 1.0 / (1.0 + (sigma / (usual * known)) ** 2)
+        found = {"lattice": -(1.0 - left) * seen / sigma}
+        result = _Result(found, {"lattice": np.broadcast_to(left, seen.shape)}, np.zeros((0, 2)))
+        sigma = _lattice_sigma(sigma, result, Priors())  # type: ignore[arg-type,assignment]
+    return float(sigma[0] / usual[0])
+
+
+def test_lattices_of_which_many_views_say_little_keep_their_usual_spread() -> None:
+    """Sixty views whose tilts leave a stretch uncertain by twelve usual spreads say five by chance."""
+    rng = np.random.default_rng(1)
+    drawn = np.array([lattice_spread(1.0, 12.0, rng) for _ in range(100)])
+    assert np.mean(drawn < 2.0) > 0.95
+
+
+def test_lattices_that_are_stretched_have_a_spread_that_is_found() -> None:
+    rng = np.random.default_rng(2)
+    drawn = np.array([lattice_spread(6.0, 3.0, rng) for _ in range(100)])
+    # The spread of 60 values with this noise is known to 11 %.
+    assert np.mean(drawn) == pytest.approx(6.0, rel=0.05)
+    assert np.std(drawn) < 0.15 * 6.0

@@ -197,6 +197,10 @@ USUAL_WEIGHT = TABLE.measured(
     "large or as small, 9 cases are decided alike, and errors change by 1.0 % at most.",
     command=TRIED,
 )
+USUAL_LATTICES = TABLE.defined(
+    "USUAL_LATTICES", 1.0, "effects",
+    "Of a stretch or shear of lattices for which the usual spread counts: one lattice.",
+)
 SPREAD_MIN = TABLE.measured(
     "SPREAD_MIN", 0.01, "of the usual spread",
     "Below it, no view shows a spread. 1.5 times as large or as small, 9 cases are decided alike, and errors change "

@@ -48,17 +48,22 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     SPREAD_MEMORY,
     SPREAD_MIN,
     SPREAD_STEP_MAX,
+    USUAL_LATTICES,
     USUAL_WEIGHT,
 )
 
 
-def _update(sigma: float, usual: float, residuals: Array, variance: Array) -> Spread:
-    """Update a spread from the residuals of its prior, in sigmas, and their posterior variances."""
+def _update(
+    sigma: float, usual: float, residuals: Array, variance: Array, known: float = USUAL_WEIGHT
+) -> Spread:
+    """Update a spread from the residuals of its prior, in sigmas, and their posterior variances.
+
+    The usual spread counts as ``known`` observed effects.
+    """
     known_part = np.maximum(1.0 - variance, 0.0)
     determined = float(np.sum(known_part))
     # The information of the data on an effect is (1 / variance - 1) / sigma^2.
     visible = float(np.sum(known_part / (known_part + variance * (sigma / usual) ** 2)))
-    known = USUAL_WEIGHT
     square = (sigma**2 * float(np.sum(residuals**2)) + known * usual**2) / (determined + known)
     return Spread(
         float(np.clip(np.sqrt(square), SPREAD_MIN * usual, SPREAD_MAX * usual)), determined, visible
@@ -189,10 +194,12 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
 def _lattice_sigma(sigma: Array | None, result: BundleResult, priors: Priors) -> Array | None:
     if sigma is None:
         return None
+    # A tilt does nearly what a stretch does, so that many views may say a little each: what all of them together do not
+    # say more clearly than a single lattice would, stays as it usually is.
     residuals, variance = result.prior_residuals["lattice"], result.prior_variance["lattice"]
     return np.array(
         [
-            _update(s, usual, residuals[:, k], variance[:, k]).sigma
+            _update(s, usual, residuals[:, k], variance[:, k], USUAL_LATTICES).sigma
             for k, (s, usual) in enumerate(zip(sigma, usual_lattice_sigmas(priors), strict=True))
         ]
     )

@@ -50,6 +50,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     MISFIT_RATIO,
     OUTLIER_FALSE_ALARMS,
     SHAPE_SPREAD_MIN,
+    SMOOTHER_ORDERS,
     STEP_LEFT_MIN,
     SWAMPED_PART,
     TILT_SIGMAS,
@@ -131,12 +132,16 @@ def find_change_point(setup: Setup, adjustment: Adjustment) -> ChangePoint | Non
         return None
     own = columns_of(adjustment.functions)["scale"]
     smooth = adjustment.problem.designs[:, 0, own] / setup.nominal_px_per_m(g)[:, None]
+    place = np.log(g / np.sqrt(g[0] * g[-1]))
+    size = adjustment.functions["scale"].smooth_size
+    orders = range(size, size + min(SMOOTHER_ORDERS, len(g) - smooth.shape[1] - 1))
+    further = np.stack([place**k for k in orders], axis=1) if orders else np.zeros((len(g), 0))
     try:
         scales = _free_scales(setup, adjustment)
     except np.linalg.LinAlgError:
         # By itself, the scale of a magnification is not determined.
         return None
-    found = find_change(scales, smooth, [where for _, _, where in candidates])
+    found = find_change(scales, smooth, [where for _, _, where in candidates], further)
     if found is None:
         return None
     below, above, _ = candidates[found[0]]
@@ -144,14 +149,15 @@ def find_change_point(setup: Setup, adjustment: Adjustment) -> ChangePoint | Non
 
 
 def find_change(
-    scales: FreeScales, smooth: Array, candidates: Sequence[Mask]
+    scales: FreeScales, smooth: Array, candidates: Sequence[Mask], further: Array
 ) -> tuple[int, float, float] | None:
     """Find the candidate by which the scales change most significantly besides a smooth function.
 
     How much they scatter about it is not known: it is estimated from what the function and the change leave, from what
     visits of the same magnification differ by, and from the usual scatter of visits as one observation, so that a
     change has to be significant by Student's t. Without one, one is found with the chance `JUMP_FALSE_ALARMS`, shared
-    among the candidates by Bonferroni's inequality.
+    among the candidates by Bonferroni's inequality. Nor is it a change what a smooth function of a few more
+    coefficients explains better: a course of the scale that the chosen one is too stiff for does not scatter.
 
     Parameters
     ----------
@@ -161,6 +167,8 @@ def find_change(
         (M, K) values of the functions whose sum is the smooth one.
     candidates
         (M,) where the scale is changed, for each; at least one.
+    further
+        (M, F) values of the next functions, by which a smooth one would bend more.
 
     Returns
     -------
@@ -173,7 +181,7 @@ def find_change(
     left = scales.whiten(scales.departure)
     left -= basis @ (basis.T @ left)
     highest = -float(stdtrit(freedom, 0.5 * JUMP_FALSE_ALARMS / len(candidates)))
-    best = None
+    best, gained = None, 0.0
     for k, where in enumerate(candidates):
         change = scales.whiten(where.astype(np.float64))
         whole = change @ change
@@ -186,7 +194,10 @@ def find_change(
         sigma = float(np.sqrt((np.maximum(scatter, 0.0) + 1.0) / (freedom * information)))
         if abs(size) > highest * sigma:
             highest = abs(size) / sigma
-            best = k, size, sigma
+            best, gained = (k, size, sigma), float(size**2 * information)
+    bends = np.linalg.qr(scales.whiten(further) - basis @ (basis.T @ scales.whiten(further)))[0]
+    if best is not None and np.sum((bends.T @ left) ** 2) > gained:
+        return None
     return best
 
 

@@ -152,6 +152,11 @@ JUMP_FALSE_ALARMS = TABLE.defined(
     "With which a recording without a jump of the scale is said to have one, at any of its places and in either "
     "direction: once in 100 recordings.",
 )
+SMOOTHER_ORDERS = TABLE.stated(
+    "SMOOTHER_ORDERS", 2, "coefficients",
+    "By which a smooth scale may bend more than the chosen one, instead of a jump: a wave has no more extremes "
+    "than one between two magnifications each, and of a step two orders explain a part only.",
+)
 STEP_LEFT_MIN = TABLE.stated(
     "STEP_LEFT_MIN", 1e-3, "of the information",
     "On a step of the scale, that the chosen function has to leave: where it can follow the step, there is nothing to "
