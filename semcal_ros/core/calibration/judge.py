@@ -281,8 +281,19 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
     # By scores: a few outliers are no misfit of functions.
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
-    if misfit > MISFIT_MAX:
-        excess_px, excess_at = measure_excess(setup, fit)
+    excess_px, excess_at = measure_excess(setup, fit)
+    if fit.shared_px > 0.0:
+        each_px = np.hypot(own_px, fit.shared_px)
+        findings.append(
+            Finding(
+                f"scale: neighbouring corners are off alike, by {excess_px:.2g} px, in each view otherwise, so that "
+                f"each counts as uncertain by {each_px:.2g} px: by charging, a drift that changes within an image, or "
+                "a grid that is not flat. Let stage and lenses settle, scan faster, or record more views",
+                excess_px,
+                magnification=excess_at,
+            )
+        )
+    elif misfit > MISFIT_MAX:
         findings.append(
             Finding(
                 f"scale: residuals are {misfit:.1f} times what the uncertainty of the corners explains: the functions "

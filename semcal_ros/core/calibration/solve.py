@@ -29,6 +29,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     refine,
 )
 from semcal_ros.core.calibration.estimator.common_tilt import common_tilt_covariance
+from semcal_ros.core.calibration.estimator.correlated_errors import estimate_shared_excess_px
 from semcal_ros.core.calibration.estimator.poses import (
     right_way_up,
     try_other_poses,
@@ -97,7 +98,10 @@ class JointFit:
     pattern
         What is irregular about the grid, or None.
     excess_px
-        1-sigma per axis, px, by which all corners scatter beyond their own.
+        1-sigma per axis, px, by which the corners are taken to be more uncertain than by their own: they scatter by it,
+        or neighbouring ones are off alike.
+    shared_px
+        What the second of these requires; 0 where neighbouring corners share no error.
     parts
         What the covariance of the functions consists of.
     """
@@ -108,6 +112,7 @@ class JointFit:
     field: FittedField | None
     pattern: GridPattern | None
     excess_px: float
+    shared_px: float
     parts: CovarianceParts
 
 
@@ -190,7 +195,9 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     """
     adjustment, field = selection.adjustment, selection.field
     on_stage("final adjustment", 0.75)
-    final = setup = with_excess(selection.setup, selection.excess_px)
+    shared_px = estimate_shared_excess_px(selection.setup, adjustment.problem, adjustment.result)
+    excess_px = max(selection.excess_px, shared_px)
+    final = setup = with_excess(selection.setup, excess_px)
     if field is not None:
         final = undo_field(setup, field.field)
     # The corners are believed to their own noise now.
@@ -222,7 +229,8 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
         covariance,
         field,
         selection.pattern,
-        selection.excess_px,
+        excess_px,
+        shared_px,
         split_covariance(padded),
     )
 

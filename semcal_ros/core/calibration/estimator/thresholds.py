@@ -301,6 +301,32 @@ LAG_PAIRS_MIN = TABLE.measured(
     "a thousand times or a thousandth of it does.",
     command=TRIED,
 )
+REGIONS_ACROSS = TABLE.stated(
+    "REGIONS_ACROSS", 4, "regions",
+    "Of an image along either axis, whose means are compared: small beside the image, so that the pose and the camera "
+    "take little of them, and large enough for some corners in each.",
+)
+REGIONS_TAKEN = TABLE.derived(
+    "REGIONS_TAKEN", 3, "means",
+    "Of a view, that its pose takes: along y, a shift and two slopes.",
+)
+REGIONS_MIN = TABLE.derived(
+    "REGIONS_MIN", 8, "regions",
+    "In sight in two views, to compare these: half of all.",
+)
+REGION_CORNERS_MIN = TABLE.derived(
+    "REGION_CORNERS_MIN", 2, "corners",
+    "In a region: a single one shares nothing.",
+)
+REGION_FALSE_ALARMS = TABLE.defined(
+    "REGION_FALSE_ALARMS", 1e-3, "chance",
+    "With which corners that are independent are made more uncertain.",
+)
+MEDIAN_FREEDOM = TABLE.derived(
+    "MEDIAN_FREEDOM", 0.42, "of the degrees of freedom",
+    "That count for a median over pairs of neighbouring views: 2 / pi, since it is a median, and 2 / 3, since each "
+    "view is in two pairs, whose squared differences have a correlation of a quarter.",
+)
 RESERVE_SIZE = TABLE.measured(
     "RESERVE_SIZE", 2, "coefficients",
     "Zero ones that are added to those that were chosen: what the views leave open of them enters the covariance. 1.5 "

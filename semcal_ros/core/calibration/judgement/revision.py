@@ -33,8 +33,12 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     refine,
     residual_variance,
 )
+from semcal_ros.core.calibration.estimator.correlated_errors import (
+    estimate_jitter,
+    estimate_shared_excess_px,
+    jitter_covariance,
+)
 from semcal_ros.core.calibration.estimator.poses import adjust
-from semcal_ros.core.calibration.estimator.posterior import estimate_jitter, jitter_covariance
 from semcal_ros.core.calibration.estimator.problem import (
     Priors,
     Setup,
@@ -49,10 +53,14 @@ from semcal_ros.core.calibration.estimator.variance_components import update_com
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.judgement.thresholds import DRIFT_UPDATES, FREE_CHANGE
 from semcal_ros.core.calibration.stage import StageAxis
-from semcal_ros.core.calibration.start import add_shared_unknowns, align_lattices, mark_untilted
+from semcal_ros.core.calibration.start import (
+    add_shared_unknowns,
+    align_lattices,
+    mark_untilted,
+    with_excess,
+)
 from semcal_ros.core.calibration.views import (
     GridView,
-    add_excess_noise,
     estimate_excess_sigma_px,
     refuse_tilted_lines,
 )
@@ -275,16 +283,22 @@ def revise(
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
     result = adjust(problem, State(theta, poses.rotations, poses.translations_m))
+    own_px = float(np.median(np.concatenate([view.sigma_px for view in setup.views])))
+    shared_px = estimate_shared_excess_px(setup, problem, result)
+    if shared_px > 0.0:
+        setup = with_excess(setup, shared_px)
+        problem = _build(model, setup, spread, every)
+        result = refine(problem, result.state)
     for _ in range(DRIFT_UPDATES if problem.effects is not None else 0):
         own = update_components(setup, problem, result)
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
         problem = _build(model, setup, spread, every)
         result = refine(problem, result.state)
-    misfit = float(np.sqrt(residual_variance(problem, result)))
+    misfit = float(np.sqrt(residual_variance(problem, result)) * np.hypot(1.0, shared_px / own_px))
     freedom = problem.layout.of_view.size * len(setup.views) + len(theta)
     excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
     if excess > 0.0:
-        setup = replace(setup, views=tuple(add_excess_noise(setup.views, excess)))
+        setup = with_excess(setup, excess)
         problem = _build(model, setup, spread, every)
         result = refine(problem, result.state)
     jitter = jitter_covariance(problem, result, estimate_jitter(problem, result))
