@@ -31,6 +31,7 @@ from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.errors import CalibrationError
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import SimulatedStage, stage_views
+from tests.helpers.bent_views import bent_view
 from tests.helpers.made_once import made_once
 
 SEM = preset("jsm820")
@@ -90,6 +91,19 @@ def test_what_holds_is_valid_and_no_z_score_is_off(calibrated: CalibrationResult
     # The calibration's own error is common to all; without it, the scatter would be 0.5 to 1.5.
     assert np.std(z) < 2.0
     assert max(np.abs(z)) < 3.5
+
+
+def test_views_that_are_bent_otherwise_each_show_no_change(calibrated: CalibrationResult) -> None:
+    """By 0.1 px, as by charging: taken for independent, they showed another distortion in eight of eight checks."""
+    rng = np.random.default_rng(5)
+    for seed in range(3):
+        views = [
+            bent_view(view, 0.1, SEM.image_size, rng)
+            for view in simulated(SEM.camera_at, CHECKED, 40 + seed)
+        ]
+        done = check(calibrated, views)
+        assert done.changes == ()
+        assert done.misfit > 2.0
 
 
 @pytest.mark.parametrize(

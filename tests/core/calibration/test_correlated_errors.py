@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -24,12 +24,12 @@ import pytest
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.correlated_errors import estimate_shared_excess_px
 from semcal_ros.core.calibration.pipeline import calibrate_views
-from semcal_ros.core.calibration.views import GridView
 from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.stage import SimulatedStage, stage_views
+from tests.helpers.bent_views import bend, bent_view
 from tests.helpers.long_tests import long_but
 
-SIZE = (512, 384)
+SIZE = (512, 512)
 CORNERS, OWN_PX = 160, 0.05
 
 
@@ -57,7 +57,7 @@ class _Result:
     huber_weight: Array
 
 
-def estimated(rng: np.random.Generator, displaced, *, views: int = 12, pose: bool = True) -> float:
+def estimated(rng: np.random.Generator, displaced, *, views: int = 12) -> float:
     """What is found in views of evenly spread corners with own noise; ``displaced`` adds to it, by view and place.
 
     A pose takes a shift and two slopes of each.
@@ -66,10 +66,8 @@ def estimated(rng: np.random.Generator, displaced, *, views: int = 12, pose: boo
     for v in range(views):
         xy = rng.uniform(0.0, SIZE, (CORNERS, 2))
         left = OWN_PX * rng.normal(size=(CORNERS, 2)) + displaced(v, xy)
-        if pose:
-            taken = np.linalg.qr(np.column_stack([np.ones(CORNERS), xy]))[0]
-            left = left - taken @ (taken.T @ left)
-        residuals.append(left)
+        taken = np.linalg.qr(np.column_stack([np.ones(CORNERS), xy]))[0]
+        residuals.append(left - taken @ (taken.T @ left))
         places.append(xy)
     setup = _Setup(tuple(_View(np.full(CORNERS, OWN_PX)) for _ in range(views)))
     problem = _Problem(CORNERS * np.arange(views + 1), np.concatenate(places))
@@ -88,16 +86,20 @@ def test_independent_corners_stay_as_they_are(views):
     assert sum(estimated(rng, nothing, views=views) > 0.0 for _ in range(400)) <= 2
 
 
-def test_corners_of_a_region_that_are_off_alike_count_as_one():
-    """Sixteen regions of ten corners, each displaced by a sigma of 0.1 px: 0.1 px for each corner's root of ten."""
+def test_images_that_are_bent_by_little_count_as_if_corners_were_off_by_much():
+    """Twenty-four patterns have the variance of 160 corners: each has that of seven independent ones."""
     rng = np.random.default_rng(1)
+    found = [estimated(rng, lambda _v, xy: 0.1 * bend(xy, SIZE, rng)) for _ in range(30)]
+    assert np.mean(found) == pytest.approx(0.1 * np.sqrt(CORNERS / 24), rel=0.15)
+
+
+def test_single_corners_that_are_elsewhere_bend_no_image():
+    rng = np.random.default_rng(5)
 
     def displaced(v, xy):
-        column, row = np.floor(xy / SIZE * 4.0).astype(int).T
-        return rng.normal(0.0, 0.1, (4, 4, 2))[row, column]
+        return 1.5 * rng.normal(size=xy.shape) * (rng.random((len(xy), 1)) < 0.02)
 
-    found = [estimated(rng, displaced, pose=False) for _ in range(30)]
-    assert np.mean(found) == pytest.approx(0.1 * np.sqrt(CORNERS / 16), rel=0.1)
+    assert sum(estimated(rng, displaced) > 0.0 for _ in range(100)) <= 1
 
 
 def wave(xy):
@@ -134,17 +136,6 @@ VISITS = (100.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0)
 BETWEEN = (150.0, 350.0, 700.0, 1500.0, 3000.0)
 
 
-def bent_view(view: GridView, rng: np.random.Generator, sigma_px: float) -> GridView:
-    """The view with a displacement of its own: low cosines of both coordinates."""
-    u, v = (view.image_xy / MICROSCOPE.image_size).T
-    out = np.zeros_like(view.image_xy)
-    for i in range(5):
-        for j in range(5):
-            pattern = np.cos(np.pi * i * u) * np.cos(np.pi * j * v)
-            out += pattern[:, None] * rng.normal(size=2) * (i + j > 0)
-    return replace(view, image_xy=view.image_xy + sigma_px * out / np.sqrt(np.mean(out**2)))
-
-
 @pytest.mark.parametrize("seed", long_but(lambda seed: seed == 0, range(6)))
 def test_images_that_are_bent_otherwise_each_time_make_no_other_camera(seed):
     """A tenth of a pixel: the tilts do not make room for it, nm per pixel and points are within their sigmas."""
@@ -152,7 +143,7 @@ def test_images_that_are_bent_otherwise_each_time_make_no_other_camera(seed):
     stage = SimulatedStage(tilts_rad=(0.0, 0.4, 0.6), axis_rad=None)
     views = stage_views(MICROSCOPE.camera_at, VISITS, stage, seed=seed, most_corners=150)
     result = calibrate_views(
-        [bent_view(view, rng, 0.1) for view in views],
+        [bent_view(view, 0.1, MICROSCOPE.image_size, rng) for view in views],
         image_size=MICROSCOPE.image_size,
         display_width_m=MICROSCOPE.display_width_m,
     )

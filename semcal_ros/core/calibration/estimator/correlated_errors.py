@@ -18,7 +18,7 @@
 is that of the sandwich formula (White 1982, doi:10.2307/1912526), ``H^-1 (J' V J) H^-1``, with the covariance ``V`` of
 the residuals between lines, which is estimated from their products.
 
-*Regions*: charging, a drift within the image that does not go on evenly, or a lens that creeps while it is scanned
+*Bends*: charging, a drift within the image that does not go on evenly, or a lens that creeps while it is scanned
 displace neighbouring corners alike, in each image otherwise. Left to least squares, a tenth of a pixel of these passes
 for the perspective of other tilts, and lattices and drifts of ten times their usual size make room for them. So every
 corner is made as uncertain as many independent ones would have to be for their mean over a region to scatter as much.
@@ -28,13 +28,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial.legendre import legvander2d
 from scipy.linalg import toeplitz
 from scipy.optimize import nnls
 from scipy.special import chdtri
 
-from semcal_ros.core.arrays import Array, Indices, solve_scaled
+from semcal_ros.core.arrays import Array, Indices, equilibrate, mad_sigma, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.normal_equations import (
@@ -51,11 +53,11 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     LAG_MAX,
     LAG_PAIRS_MIN,
     MEDIAN_FREEDOM,
-    REGION_CORNERS_MIN,
-    REGION_FALSE_ALARMS,
-    REGIONS_ACROSS,
-    REGIONS_MIN,
-    REGIONS_TAKEN,
+    OUTLIER_SIGMAS,
+    SHARED_CONDITION,
+    SHARED_CORNERS,
+    SHARED_DEGREE,
+    SHARED_FALSE_ALARMS,
 )
 
 
@@ -199,16 +201,16 @@ def _positive_part(matrix: Array) -> Array:
 
 
 def estimate_shared_excess_px(setup: Setup, problem: Problem, result: BundleResult) -> float:
-    """Estimate by how much corners have to be more uncertain, since those of a region are off alike.
+    """Estimate by how much corners have to be more uncertain, since neighbouring ones are off alike.
 
-    So many independent ones would then scatter in their mean as the residuals do.
-
-    The image has :data:`REGIONS_ACROSS` regions along either axis. Their means along y are compared between views that
-    follow one another in the order of the magnifications, so that a distortion that the camera lacks, which is the same
-    in both, does not count; nor does what moves lines along x. The median over the pairs of views lets single views be
+    So many independent ones would then scatter as much in the polynomials of the place, from the second degree to
+    :data:`SHARED_DEGREE`, that describe the residuals along y. The coefficients are compared between views that follow
+    one another in the order of the magnifications, so that a distortion that the camera lacks, which is the same in
+    both, does not count; nor does what moves lines along x. The median over the pairs of views lets single views be
     wrong.
 
     It fails where there are fewer than some thirty corners in a view, and with errors that are the same in all images.
+    What changes within a fifth of the image passes for independent.
 
     Parameters
     ----------
@@ -219,40 +221,60 @@ def estimate_shared_excess_px(setup: Setup, problem: Problem, result: BundleResu
 
     Returns
     -------
-    1-sigma per axis, px, to be added to that of the corners; 0 where the means of regions scatter no more than the
-    corners of each view let expect, which by chance is not so in :data:`REGION_FALSE_ALARMS` of all recordings.
+    1-sigma per axis, px, to be added to that of the corners; 0 where the coefficients scatter no more than the corners
+    of each view let expect, which by chance is not so in :data:`SHARED_FALSE_ALARMS` of all recordings.
     """
     if problem.across is not None:
         return 0.0
-    sums, counts, squares = [], [], []
-    for part in _views(problem):
-        inlier = result.huber_weight[part] >= 1.0
-        y = np.where(inlier, result.residuals_px[part, 1], 0.0)
-        place = problem.observed_px[part] / setup.image_size * REGIONS_ACROSS
-        column, row = np.clip(place.astype(np.intp), 0, REGIONS_ACROSS - 1).T
-        region = row * REGIONS_ACROSS + column
-        sums.append(np.bincount(region, weights=y, minlength=REGIONS_ACROSS**2))
-        counts.append(np.bincount(region, weights=inlier, minlength=REGIONS_ACROSS**2))
-        squares.append(float(y @ y) / max(float(inlier.sum()), 1.0))
-    found, freedom = [], 0
-    for k in range(len(sums) - 1):
-        both = np.minimum(counts[k], counts[k + 1]) >= REGION_CORNERS_MIN
-        if both.sum() < REGIONS_MIN:
-            continue
-        first, second = counts[k][both], counts[k + 1][both]
-        change = sums[k][both] / first - sums[k + 1][both] / second
-        left = int(both.sum()) - REGIONS_TAKEN
-        variance = float(np.sum(change**2 / (1.0 / first + 1.0 / second))) / left
-        found.append((variance, variance / (0.5 * (squares[k] + squares[k + 1]))))
-        freedom += left
-    if not found:
+    bends = [_bend(setup, problem, result, part) for part in _views(problem)]
+    pairs = [(a, b) for a, b in pairwise(bends) if a is not None and b is not None]
+    if not pairs:
         return 0.0
+    found = np.empty((len(pairs), 2))
+    for k, (a, b) in enumerate(pairs):
+        change = a.coefficients - b.coefficients
+        square = change @ np.linalg.solve(a.cofactor + b.cofactor, change) / len(change)
+        found[k] = square, square / (0.5 * (a.variance_px2 + b.variance_px2))
     variance, ratio = np.median(found, axis=0)
+    freedom = len(pairs[0][0].coefficients)
     # Chi-square over its freedom has a median below 1 (Wilson and Hilferty 1931, doi:10.1073/pnas.17.12.684).
-    below = (1.0 - 2.0 / (9.0 * freedom / len(found))) ** 3
-    independent = MEDIAN_FREEDOM * freedom
-    limit = float(chdtri(independent, REGION_FALSE_ALARMS)) / independent
-    if ratio <= limit * below:
+    below = (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    independent = MEDIAN_FREEDOM * freedom * len(pairs)
+    if ratio <= below * float(chdtri(independent, SHARED_FALSE_ALARMS)) / independent:
         return 0.0
     own_px = float(np.median(np.concatenate([view.sigma_px for view in setup.views])))
     return float(np.sqrt(max(variance / below - own_px**2, 0.0)))
+
+
+@dataclass(frozen=True)
+class _Bend:
+    """How the residuals of a view along y are bent: the coefficients of polynomials from the second degree on, their
+    covariance over the variance of the corners, and this variance.
+    """
+
+    coefficients: Array
+    cofactor: Array
+    variance_px2: float
+
+
+def _bend(setup: Setup, problem: Problem, result: BundleResult, part: slice) -> _Bend | None:
+    """Return the bend of a view, or None if too few corners, or too small a part of the image, tell it."""
+    y = result.residuals_px[part, 1]
+    # By what the view itself scatters: it may be more than its corners say.
+    inlier = np.abs(y) < OUTLIER_SIGMAS * mad_sigma(y)
+    u, v = (2.0 * problem.observed_px[part][inlier] / setup.image_size - 1.0).T
+    all_of = legvander2d(u, v, (SHARED_DEGREE, SHARED_DEGREE))
+    order = np.add.outer(np.arange(SHARED_DEGREE + 1), np.arange(SHARED_DEGREE + 1)).ravel()
+    # A shift and two slopes are the pose's.
+    chosen = np.argsort(order, kind="stable")[: int(np.sum(order <= SHARED_DEGREE))]
+    design, lowest = all_of[:, chosen], 3
+    if len(design) < SHARED_CORNERS * len(chosen):
+        return None
+    y = y[inlier]
+    scaled, scale = equilibrate(design.T @ design)
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] < SHARED_CONDITION * values[-1]:
+        return None
+    cofactor = (vectors / values) @ vectors.T * np.outer(scale, scale)
+    coefficients = cofactor @ (design.T @ y)
+    return _Bend(coefficients[lowest:], cofactor[lowest:, lowest:], float(np.mean(y**2)))

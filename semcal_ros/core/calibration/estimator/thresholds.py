@@ -301,25 +301,25 @@ LAG_PAIRS_MIN = TABLE.measured(
     "a thousand times or a thousandth of it does.",
     command=TRIED,
 )
-REGIONS_ACROSS = TABLE.stated(
-    "REGIONS_ACROSS", 4, "regions",
-    "Of an image along either axis, whose means are compared: small beside the image, so that the pose and the camera "
-    "take little of them, and large enough for some corners in each.",
+SHARED_DEGREE = TABLE.stated(
+    "SHARED_DEGREE", 4, "degree",
+    "Of the polynomials in which images are compared: what disturbs poses and camera most, in twelve coefficients that "
+    "the pose hardly takes.",
 )
-REGIONS_TAKEN = TABLE.derived(
-    "REGIONS_TAKEN", 3, "means",
-    "Of a view, that its pose takes: along y, a shift and two slopes.",
+SHARED_CORNERS = TABLE.derived(
+    "SHARED_CORNERS", 2, "corners",
+    "For each coefficient: half of what they say is noise then.",
 )
-REGIONS_MIN = TABLE.derived(
-    "REGIONS_MIN", 8, "regions",
-    "In sight in two views, to compare these: half of all.",
+OUTLIER_SIGMAS = TABLE.derived(
+    "OUTLIER_SIGMAS", 5.0, "sigma",
+    "Of what a view scatters, beyond which a corner is somewhere else: by chance one in 1.7 million.",
 )
-REGION_CORNERS_MIN = TABLE.derived(
-    "REGION_CORNERS_MIN", 2, "corners",
-    "In a region: a single one shares nothing.",
+SHARED_CONDITION = TABLE.stated(
+    "SHARED_CONDITION", 1e-6, "of the largest eigenvalue",
+    "Below which corners in a part of the image do not tell the polynomials apart.",
 )
-REGION_FALSE_ALARMS = TABLE.defined(
-    "REGION_FALSE_ALARMS", 1e-3, "chance",
+SHARED_FALSE_ALARMS = TABLE.defined(
+    "SHARED_FALSE_ALARMS", 1e-3, "chance",
     "With which corners that are independent are made more uncertain.",
 )
 MEDIAN_FREEDOM = TABLE.derived(
