@@ -59,6 +59,7 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
 from semcal_ros.core.calibration.estimator.thresholds import (
     DAMPING_MIN,
     NAMED_MAX,
+    USUAL_LATTICES,
 )
 from semcal_ros.core.calibration.estimator.variance_components import (
     accelerate_components,
@@ -152,7 +153,8 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
         )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
-        updates.append((spread, update_components(setup, problem, result)))
+        after = update_components(setup, problem, result, usual_lattices=USUAL_LATTICES)
+        updates.append((spread, after))
         if largest_change(*updates[-1]) < SPREAD_CHANGE:
             break
         spread = accelerate_components(updates)
