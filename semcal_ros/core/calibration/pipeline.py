@@ -267,12 +267,18 @@ def fit_joint(
     setup: Setup,
     residual: str = "off",
     on_stage: Callable[[str, float], None] = lambda _name, _fraction: None,
+    *,
+    count_shared: bool = True,
 ) -> JointFit:
-    """Calibrate from views and nominal values alone: start, select, solve; ``on_stage`` as for ``calibrate_views``."""
+    """Calibrate from views and nominal values alone: start, select, solve.
+
+    ``on_stage`` is that of :func:`calibrate_views`, ``count_shared`` that of
+    :func:`~semcal_ros.core.calibration.solve.solve`.
+    """
     on_stage("start values", 0.0)
     started = start(setup)
     on_stage("terms and coefficients", 0.3)
-    return solve(select(started, residual), on_stage)
+    return solve(select(started, residual), on_stage, count_shared=count_shared)
 
 
 def are_enough(views: Sequence[GridView], options: CalibrationOptions) -> bool:
@@ -411,10 +417,13 @@ def _fit_without_window_bias(
     options: CalibrationOptions,
     on_stage: Callable[[str, float], None],
 ) -> tuple[JointFit, Setup, list[Finding]]:
-    """Fit again without the bias of the corners by the scan within their windows, until it no longer changes.
+    """Fit again with what neighbouring corners share, and until the bias by the scan within their windows is taken out.
 
-    Only a fit tells it. It is some tenths of a pixel at most, by which no view is left out.
+    Only a fit tells the bias. It is some tenths of a pixel at most, by which no view is left out.
     """
+    if joint.shared_px > 0.0:
+        # Views that are wrong have been left out.
+        joint = fit_joint(setup, options.residual, on_stage)
     found = setup.views
     removed = [np.zeros_like(view.image_xy) for view in found]
     left = 0.0
@@ -470,7 +479,7 @@ def _fit_without_outliers(
         return [note for name, note in found.items() if is_told or given[name].has_stage_tilt]
 
     while True:
-        fit = fit_joint(setup, options.residual, on_stage)
+        fit = fit_joint(setup, options.residual, on_stage, count_shared=False)
         wrong = find_wrong_tilts(fit.adjustment.problem, fit.adjustment.result)
         found = _find_outlier_of_few(setup) if wrong or _is_irregular(setup, fit) else {}
         if wrong and not found:

@@ -102,7 +102,7 @@ class JointFit:
         1-sigma per axis, px, by which the corners are taken to be more uncertain than by their own: they scatter by it,
         or neighbouring ones are off alike.
     shared_px
-        What the second of these requires; 0 where neighbouring corners share no error.
+        What the second of these requires, whether it is counted or not; 0 where neighbouring corners share no error.
     parts
         What the covariance of the functions consists of.
     """
@@ -132,10 +132,11 @@ def _refuse_lost_corners(setup: Setup, adjustment: Adjustment) -> None:
     )
 
 
-def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
+def _adjust_exactly(setup: Setup, adjustment: Adjustment, *, usual_spreads: bool) -> Adjustment:
     """Adjust exactly with the chosen functions, after trying both signs of every tilt.
 
-    The variance components are updated until they no longer change.
+    The variance components are updated until they no longer change. With ``usual_spreads`` they are at most the usual
+    ones: what corners share would pass for drift and stretched lattices.
     """
     functions = adjustment.functions
     # From what is usual: spreads that were wide while the model was wrong would hold it there.
@@ -154,6 +155,7 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment) -> Adjustment:
         result = right_way_up(setup, functions, problem, result)
         state = result.state
         after = update_components(setup, problem, result, usual_lattices=USUAL_LATTICES)
+        after = limit_components(setup, after) if usual_spreads else after
         updates.append((spread, after))
         if largest_change(*updates[-1]) < SPREAD_CHANGE:
             break
@@ -187,8 +189,13 @@ def without_magnification(fit: JointFit, index: int) -> tuple[Functions, Residua
     return with_coefficients(functions, result.state.theta + step), None
 
 
-def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> JointFit:
+def solve(
+    selection: Selection, on_stage: Callable[[str, float], None], *, count_shared: bool = True
+) -> JointFit:
     """Adjust exactly, and compute the covariance; ``on_stage`` as for ``calibrate_views``.
+
+    Without ``count_shared`` corners that are off alike count as independent ones: a view that is wrong, or a tilt of
+    the stage, bends what others leave of it as well, and shows as wrong only then.
 
     Raises
     ------
@@ -198,7 +205,7 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     adjustment, field = selection.adjustment, selection.field
     on_stage("final adjustment", 0.75)
     shared_px = estimate_shared_excess_px(selection.setup, adjustment.problem, adjustment.result)
-    excess_px = max(selection.excess_px, shared_px)
+    excess_px = max(selection.excess_px, shared_px if count_shared else 0.0)
     final = setup = with_excess(selection.setup, excess_px)
     if field is not None:
         final = undo_field(setup, field.field)
@@ -215,7 +222,8 @@ def solve(selection: Selection, on_stage: Callable[[str, float], None]) -> Joint
     )
     if field is None:
         adjustment = add_late_terms(final, adjustment, always=SMOOTH_AT_LAST)
-    adjustment = _adjust_exactly(final, adjustment)
+    uncounted = shared_px > 0.0 and not count_shared
+    adjustment = _adjust_exactly(final, adjustment, usual_spreads=uncounted)
     _refuse_lost_corners(final, adjustment)
     if field is not None:
         system = field_system(setup, adjustment.problem, adjustment.result, field.field)
