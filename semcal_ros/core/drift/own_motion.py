@@ -272,16 +272,17 @@ def measure_displacement(
     level = make_level(Pyramid(first), 1, BODY_SMOOTHED_PX)
     if level is None or start is None:
         return None
+    level = replace(level, noise_variance=smoothed)
     image = Pyramid(second)
 
     def show_body(shift: Array) -> Mask:
         return inside & fill_bodies(evidence & (pair.compare(shift) < as_ground), BODY_GAP_PX)
 
-    first_px = _find_shift(level, image, show_body(start), start + pair.offset, smoothed)
+    first_px = _find_shift(level, image, show_body(start), start + pair.offset)
     if first_px is None or np.max(np.abs(first_px - pair.offset - start)) > BODY_BEYOND_PX:
         return None
     mask = show_body(first_px - pair.offset)
-    best = _align(level, image, mask, first_px, smoothed)
+    best = _align(level, image, mask, first_px)
     if best is None:
         return None
     shift = best.shift_px - pair.offset
@@ -291,7 +292,7 @@ def measure_displacement(
     if not _is_body(best, covariance, shift - moved_px, smoothed):
         # A second look only adds to the covariance.
         return None
-    with_ring = _find_shift(level, image, grow_mask(mask, RING_PX), best.shift_px, smoothed)
+    with_ring = _find_shift(level, image, grow_mask(mask, RING_PX), best.shift_px)
     if with_ring is None:
         return None
     by_ring = PART_OF_RING * (with_ring - best.shift_px)
@@ -394,9 +395,7 @@ class _Pair:
         return 2.0 * np.array([col, row], dtype=np.float64) - BODY_REACH_PX
 
 
-def _align(
-    level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array, smoothed: float
-) -> Alignment | None:
+def _align(level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array) -> Alignment | None:
     """Refine a shift by the pixels of a mask alone."""
     part, counts = _keep_pixels(level, mask)
     found = align_reweighted(
@@ -404,19 +403,16 @@ def _align(
         image,
         start_px,
         counts,
-        smoothed,
         lambda tiles: counts[tiles.rows, tiles.cols],
         looks=False,
     )
     return None if isinstance(found, Rejection) or not found.converged else found
 
 
-def _find_shift(
-    level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array, smoothed: float
-) -> Array | None:
+def _find_shift(level: PyramidLevel, image: Pyramid, mask: Mask, start_px: Array) -> Array | None:
     """As :func:`_align`, the shift (2,) alone."""
     part, counts = _keep_pixels(level, mask)
-    return shift_of_tiles(part, image, start_px, counts, smoothed)
+    return shift_of_tiles(part, image, start_px, counts)
 
 
 def _keep_pixels(level: PyramidLevel, mask: Mask) -> tuple[PyramidLevel, Array]:

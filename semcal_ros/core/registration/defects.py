@@ -360,7 +360,7 @@ def _refine(
     def keep(tiles: TileStatistics) -> Array:
         return weights[tiles.rows, tiles.cols]
 
-    return align_reweighted(level, pyramid, shift, weights, noise.reference, keep, looks=False)
+    return align_reweighted(level, pyramid, shift, weights, keep, looks=False)
 
 
 def _weigh_tiles(shown: _Shown, shift: Array, noise: TileNoise) -> Array:
@@ -393,9 +393,7 @@ def _leave_out(
         return counted
 
     weights = _weigh_tiles(shown, shift, noise)
-    alignment = align_reweighted(
-        shown.level, pyramid, shift, weights, noise.reference, judge, looks=False
-    )
+    alignment = align_reweighted(shown.level, pyramid, shift, weights, judge, looks=False)
     if isinstance(alignment, Rejection):
         return alignment
     if np.max(np.abs(alignment.shift_px - shift)) > SAME_SHIFT_PX:

@@ -327,8 +327,7 @@ def unmeasured_alignment() -> Alignment:
 class _Comparison:
     """The pixels of one level compared at one shift; shifts in px of the level.
 
-    ``plain`` are the sums without the ``weights`` (rows, cols) of the tiles, and ``noise`` is the variance per pixel
-    that the squares of the reference in the geometry lack.
+    ``plain`` are the sums without the ``weights`` (rows, cols) of the tiles.
     """
 
     level: PyramidLevel
@@ -340,7 +339,6 @@ class _Comparison:
     shift: Array
     image_size: tuple[int, int]
     mean: float
-    noise: float = 0.0
     weights: Array | None = None
 
     @cached_property
@@ -387,7 +385,7 @@ class _Comparison:
     @cached_property
     def ratio_of_contrasts(self) -> float:
         """Standard deviation of the image within its tiles over that of the reference with its noise."""
-        return _ratio_of_contrasts(self.geometry, self.sums, self.noise)
+        return _ratio_of_contrasts(self.geometry, self.sums, self.level.noise_variance)
 
     def weighs_alike(self, window: TileWindow, weights: Array | None) -> bool:
         """Whether the tiles of a window are those of this comparison, with the same weights."""
@@ -511,7 +509,6 @@ def align_reweighted(
     image: Pyramid,
     start_px: Array,
     weights: Array,
-    noise: float,
     reweight: Callable[[TileStatistics], Array],
     *,
     looks: bool = True,
@@ -528,8 +525,6 @@ def align_reweighted(
         (2,) shift, right to about a pixel.
     weights
         (rows, cols) first weights of the reference's tiles.
-    noise
-        Variance of its noise per pixel, after smoothing.
     reweight
         From the statistics of the compared tiles to their weights. What it was asked last is where the shift was found.
     looks
@@ -539,12 +534,12 @@ def align_reweighted(
     -------
     The alignment, which may not have converged; or a rejection as of :func:`align`.
     """
-    found = _descend(level, image, start_px, weights, noise, reweight, looks)
+    found = _descend(level, image, start_px, weights, reweight, looks)
     return found if isinstance(found, Rejection) else _summarise(*found)
 
 
 def shift_of_tiles(
-    level: PyramidLevel, image: Pyramid, start_px: Array, weights: Array, noise: float
+    level: PyramidLevel, image: Pyramid, start_px: Array, weights: Array
 ) -> Array | None:
     """(2,) the shift of tiles with weights (rows, cols) as :func:`align_reweighted` finds it, and nothing else; None
     where it does not converge.
@@ -554,7 +549,6 @@ def shift_of_tiles(
         image,
         start_px,
         weights,
-        noise,
         lambda tiles: weights[tiles.rows, tiles.cols],
         looks=False,
     )
@@ -568,7 +562,6 @@ def _descend(
     image: Pyramid,
     start_px: Array,
     weights: Array,
-    noise: float,
     reweight: Callable[[TileStatistics], Array],
     looks: bool,
 ) -> tuple[_Comparison, Array, bool, int] | Rejection[MatchFailure]:
@@ -590,7 +583,6 @@ def _descend(
             None,
             ALL_PIXELS,
             weights,
-            noise,
             before=latest,
         )
         if isinstance(comparison, Rejection):
@@ -624,14 +616,13 @@ def _compare(
     hessian: Array | None,
     enough: int = HESSIAN_PIXELS,
     weights: Array | None = None,
-    noise: float = 0.0,
     held: Array | None = None,
     before: _Comparison | None = None,
 ) -> _Comparison | Rejection[MatchFailure]:
     """Sums and fit at a shift in px of the level; ``hessian`` is that of an earlier
-    comparison, None to compute it from enough pixels. ``weights`` (rows, cols) are those of the reference's tiles, and
-    ``noise`` the variance of its smoothed pixels. ``held`` is as for :func:`align`. What a comparison ``before`` of the
-    same level and noise has of the same tiles with the same weights is not computed again.
+    comparison, None to compute it from enough pixels. ``weights`` (rows, cols) are those of the reference's tiles.
+    ``held`` is as for :func:`align`. What a comparison ``before`` of the same level has of the same tiles with the same
+    weights is not computed again.
     """
     pixels = image.centred(level.factor)
     size = pixels.shape[1], pixels.shape[0]
@@ -645,22 +636,19 @@ def _compare(
     if before is not None and before.weighs_alike(window, weights):
         geometry = before.geometry
     else:
-        geometry = prepare_geometry(level, window, weights, noise)
+        geometry = prepare_geometry(level, window, weights)
     sums = tile_sums(level, window, pixels, shift, hessian, enough, weights)
     plain = sums
     if weights is not None:
         sums = sums.weighted(weights)
     fit = solve_step(geometry, sums, held)
-    lacks = 0.0 if weights is None else noise
     if fit is None:
         information = sums.hessian * np.outer(geometry.gradient_share, geometry.gradient_share)
-        contrast = _ratio_of_contrasts(geometry, sums, lacks)
+        contrast = _ratio_of_contrasts(geometry, sums, level.noise_variance)
         return _find_chance_gradient(level, geometry, contrast, information, enough) or Rejection(
             MatchFailure.UNDETERMINED, _FEATURELESS
         )
-    return _Comparison(
-        level, window, geometry, sums, plain, fit, shift, size, image.mean, lacks, weights
-    )
+    return _Comparison(level, window, geometry, sums, plain, fit, shift, size, image.mean, weights)
 
 
 def _find_chance_gradient(
@@ -809,7 +797,9 @@ def _summarise(
     whole = comparison.geometry.total
     cross = comparison.sums.cross.reshape(-1, 4).sum(axis=0)
     pixels = float(whole[3, 3])
-    error = float(squared_residuals(comparison.geometry, comparison.sums, fit).sum())
+    # Of weighted tiles, the noise of the reference does not count.
+    noise = level.noise_variance if comparison.weights is None else 0.0
+    error = float(squared_residuals(comparison.geometry, comparison.sums, fit, noise).sum())
     gain = float(fit.gain[0])
     weights = comparison.tile_information
     difference, variance = _compare_halves(comparison, covariance, weights)
@@ -826,7 +816,7 @@ def _summarise(
         offset=float(fit.offset[0]) + comparison.mean - gain * level.mean,
         residual_rms=float(np.sqrt(max(error, 0.0) / pixels)),
         reference_variance=float(whole[2, 2] - whole[2, 3] ** 2 / pixels) / pixels
-        + comparison.noise,
+        + level.noise_variance,
         image_variance=float(comparison.sums.energy.sum() - cross[3] ** 2 / pixels) / pixels,
         common_covariance=float(cross[2] - whole[2, 3] * cross[3] / pixels) / pixels,
         overlap=_overlap_fraction(level.size, comparison.image_size, comparison.improved),
@@ -1069,7 +1059,9 @@ def tile_residual_energies(
     if isinstance(comparison, Rejection):
         return None
     energies = np.full(level.normal_matrices.shape[:2], np.nan)
-    squares = squared_residuals(comparison.geometry, comparison.sums, comparison.fit)
+    squares = squared_residuals(
+        comparison.geometry, comparison.sums, comparison.fit, level.noise_variance
+    )
     window = comparison.window
     counts = level.pixel_counts[window.rows, window.cols]
     energies[window.rows, window.cols] = squares.reshape(counts.shape) / counts

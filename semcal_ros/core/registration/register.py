@@ -289,7 +289,8 @@ def prepare_reference(
     for factor in _reduction_factors(gray.shape):
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
         if level is not None:
-            levels.append(level)
+            noise = statistics.noise_variance / factor**2 * passed_variance(level.sigma_px)
+            levels.append(replace(level, noise_variance=noise))
     if not levels:
         defect = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     left, top, right, bottom = inside

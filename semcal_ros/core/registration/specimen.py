@@ -164,7 +164,6 @@ def keep_specimen(
                 pyramid,
                 np.array(start.shift_px),
                 judge.first(first),
-                noise.reference,
                 judge,
                 looks=known is None,
             )

@@ -43,7 +43,7 @@ class TileGeometry:
     Attributes
     ----------
     normal_matrices
-        (n, 4, 4) normal matrices of the tiles, as in :class:`.tiles.PyramidLevel`.
+        (n, 4, 4) normal matrices of the tiles, as in :class:`.tiles.PyramidLevel`, without the noise of the levels.
     ramps
         (n, p) factors of the p terms of gain and offset: a constant and two ramps, or the constant
         alone where the ramps would explain away most of the gradient, as for a lone particle.
@@ -113,27 +113,28 @@ class TileFit:
 
 
 def prepare_geometry(
-    level: PyramidLevel, window: TileWindow, weights: Array | None = None, noise: float = 0.0
+    level: PyramidLevel, window: TileWindow, weights: Array | None = None
 ) -> TileGeometry:
-    """Geometry of a window; that of the latest one without weights is kept, because drift is slow.
+    """Geometry of a window, with ``weights`` (rows, cols) of its tiles; that of the latest one without weights is kept,
+    because drift is slow.
 
-    With ``weights`` (rows, cols) of the tiles, the variance ``noise`` per pixel of the smoothed reference does not
-    lower the gain: what a gain that is too small leaves of a structure that is cut by the edge of the tiles that count,
-    would pull the shift.
+    The noise of the reference does not lower the gain. It would where there is nothing else, and so tilt the ramp of
+    the gain across a structure that lies apart from the middle, which a shift makes up for; so it would at the edge of
+    the tiles that count.
     """
     if weights is not None:
-        return _compute_geometry(level, window, weights, noise)
+        return _compute_geometry(level, window, weights)
     return level.geometries.get_or_compute(window.key, lambda: _compute_geometry(level, window))
 
 
 def _compute_geometry(
-    level: PyramidLevel, window: TileWindow, weights: Array | None = None, noise: float = 0.0
+    level: PyramidLevel, window: TileWindow, weights: Array | None = None
 ) -> TileGeometry:
     shape = len(window.y), len(window.x)
     normal_matrices = level.normal_matrices[window.rows, window.cols].reshape(-1, 4, 4)
-    if weights is not None:
-        normal_matrices = normal_matrices * weights.reshape(-1, 1, 1)
-        normal_matrices[:, 2, 2] -= noise * normal_matrices[:, 3, 3]
+    factors = np.ones(1) if weights is None else weights.ravel()
+    normal_matrices = normal_matrices * factors[:, None, None]
+    normal_matrices[:, 2, 2] -= level.noise_variance * normal_matrices[:, 3, 3]
     ramps, pairs = _make_ramps(shape)
     whole = (normal_matrices.reshape(-1, 16).T @ pairs).reshape(4, 4, 3, 3).transpose(0, 2, 1, 3)
     energy = np.diag(whole[:2, 0, :2, 0])
@@ -209,11 +210,14 @@ def solve_step(geometry: TileGeometry, sums: TileSums, held: Array | None = None
     return TileFit(scores, information, terms[:count], terms[count:], step)
 
 
-def squared_residuals(geometry: TileGeometry, sums: TileSums, fit: TileFit) -> Array:
-    """(n,) squares of what gain and offset leave, summed over each tile."""
+def squared_residuals(geometry: TileGeometry, sums: TileSums, fit: TileFit, noise: float) -> Array:
+    """(n,) squares of what gain and offset leave, summed over each tile, with the ``noise`` of the reference per pixel
+    in them.
+    """
     normal_matrices, cross = geometry.normal_matrices, sums.cross.reshape(-1, 4)
     gain, offset = geometry.ramps @ fit.gain, geometry.ramps @ fit.offset
-    model = gain**2 * normal_matrices[:, 2, 2] + offset**2 * normal_matrices[:, 3, 3]
+    levels = normal_matrices[:, 2, 2] + noise * normal_matrices[:, 3, 3]
+    model = gain**2 * levels + offset**2 * normal_matrices[:, 3, 3]
     model += 2.0 * gain * offset * normal_matrices[:, 2, 3]
     explained = gain * cross[:, 2] + offset * cross[:, 3]
     return sums.energy.ravel() - 2.0 * explained + model

@@ -76,6 +76,8 @@ class PyramidLevel:
     normal_matrices
         (rows, cols, 4, 4) products of those three and of the constant 1 with each other, summed
         over each tile.
+    noise_variance
+        Of the smoothed pixels, in squared grey levels.
     dropped
         (rows, cols, n) True at pixels that do not count (:func:`drop_pixels`); None where all do.
     """
@@ -88,6 +90,7 @@ class PyramidLevel:
     mean: float
     products: Image
     normal_matrices: Array
+    noise_variance: float = 0.0
     dropped: Mask | None = None
     #: The level of which they were dropped.
     undropped: PyramidLevel | None = field(default=None, repr=False, compare=False)

@@ -209,20 +209,23 @@ def test_a_tool_at_rest_from_the_first_frame_on_is_not_followed() -> None:
     assert update.moving is not None or update.fixed is not None
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_tool_at_rest_over_particles_in_the_middle_is_not_followed(seed: int) -> None:
+def test_a_tool_at_rest_over_particles_in_the_middle_is_not_followed() -> None:
     """They lie together, where those of a tool may; but they are inside the image, and many."""
-    tracker, accepted, wrong = DriftTracker(), 0, 0
-    for k in range(25):
-        truth = np.array([0.12 * k, -0.45 * k])
-        image = _draw((truth[0], truth[1]), 100 * seed + k, margin_px=80.0, count=8)
-        update = tracker.update(image, float(k))
-        accepted += update.accepted
-        off = np.abs(update.drift_px - truth)
-        wrong += bool(np.any((off > 0.1) & (off > 4.0 * update.sigma_px)))
-    # Followed, it was wrong in 17, 16 and 4 frames, by 11 px in the end. In one of the first it still pulls.
-    assert update.accepted and accepted >= 22 and wrong <= 1
-    assert np.all(off < 0.15)
+    accepted, wrong = 0, 0
+    for seed in range(4):
+        tracker = DriftTracker()
+        for k in range(25):
+            truth = np.array([0.12 * k, -0.45 * k])
+            image = _draw((truth[0], truth[1]), 100 * seed + k, margin_px=80.0, count=8)
+            update = tracker.update(image, float(k))
+            accepted += update.accepted
+            off = np.abs(update.drift_px - truth)
+            wrong += bool(np.any((off > 0.1) & (off > 4.0 * update.sigma_px)))
+        # Followed, it was off by 11 px here.
+        assert not update.accepted or np.all(off < 0.15)
+    # Followed, it was wrong in half of the frames. In one of the first it may still pull; where either may be the
+    # specimen, a frame is refused.
+    assert wrong <= 1 and accepted >= 70
 
 
 def test_lines_that_end_beside_other_bodies_tell_no_shift_across_them() -> None:

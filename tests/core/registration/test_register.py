@@ -147,6 +147,33 @@ def test_a_change_of_shading_does_not_pull_the_shift() -> None:
     np.testing.assert_allclose(result.shift_px, [4.3, -2.2], atol=0.02)
 
 
+@pytest.mark.parametrize("place", [(128.0, 200.0), (60.0, 190.0), (200.0, 60.0)])
+def test_noise_where_nothing_is_does_not_pull_a_cluster_towards_the_middle(
+    place: tuple[float, float],
+) -> None:
+    """It would lower the gain there, and so tilt it across the cluster: by 0.14 px at a stated 0.07, and at rest."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[0.0:256.0, 0.0:256.0]
+    picture = np.full((256, 256), 55.0)
+    for _ in range(14):
+        left, top = place + rng.uniform(-22.0, 22.0, 2)
+        distance = np.hypot(x - left, y - top)
+        picture += rng.uniform(40.0, 90.0) * stats.norm.cdf(
+            (rng.uniform(3.0, 7.0) - distance) / 1.2
+        )
+    found = []
+    for seed in range(24):
+        pair = (noisy(picture, 16.0, 2 * seed + k, 0.0, 1.0) for k in range(2))
+        result = register_pair(*pair)
+        if result.accepted:
+            found.append([*result.shift_px, *np.sqrt(np.diag(result.covariance))])
+    assert len(found) > 18
+    shifts, sigmas = np.split(np.array(found), 2, axis=1)
+    # The mean of 20 is known to a quarter of their sigma.
+    assert np.all(np.abs(shifts.mean(axis=0)) < 0.75 * np.median(sigmas, axis=0))
+    assert np.all(np.std(shifts, axis=0) < 1.6 * np.median(sigmas, axis=0))
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_pixel_types(dtype: type) -> None:
     scale = 200.0 if dtype is np.uint16 else 1.0
