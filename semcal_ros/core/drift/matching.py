@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import AnyImage, Array, Mask
+from semcal_ros.core.arrays import AnyImage, Array, Mask, solve_scaled
 from semcal_ros.core.drift.camera_uncertainty import visit_scale_variance
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.keyframe_store import Candidate
@@ -33,7 +33,10 @@ from semcal_ros.core.drift.measurement import (
 from semcal_ros.core.drift.operations import Measure
 from semcal_ros.core.drift.remade_keyframes import correct_shear, forget_mean, single_keyframe
 from semcal_ros.core.drift.similarity import SimilarityMatch, constrain_registration
+from semcal_ros.core.drift.state import DriftState
 from semcal_ros.core.drift.thresholds import (
+    INNOVATION_CHI2_MAX,
+    KNOWN_SHEAR_PX,
     MEAN_COUNTS,
     PULLED_CHI2_MIN,
     PULLED_PX,
@@ -131,23 +134,55 @@ def match_keyframe(
     for _ in range(REGISTRATIONS_MAX - 1):
         if isinstance(match, RejectedMatch):
             break
-        drift = match.measure(state.filter.state, state.filter.process_noise).state
-        if not is_removable(drift.motion, frame):
+        outcome = match.measure(state.filter.state, state.filter.process_noise)
+        drift = outcome.state
+        is_jump = outcome.nis > INNOVATION_CHI2_MAX and not _shows_shear(match)
+        if is_jump or not is_removable(drift.motion, frame):
             # A jump, not a drift: the gate decides.
             break
         corrected = False
         if not candidate.rescaled:
             state, corrected = correct_shear(setup, state, candidate.key, drift)
         turned = match.similarity.remaining_px(frame.size) > TURN_LEFT_PX
-        moved = exceeds_tolerance(drift.motion - match.removed, frame)
+        known = _is_known(drift, match.removed, frame)
+        moved = known and exceeds_tolerance(drift.motion - match.removed, frame)
         if not (corrected or moved or turned):
             break
         turn = match.similarity.turn
-        state, again = _register(setup, state, frame, candidate, drift.motion, turn)
+        motion = drift.motion if known else match.removed
+        state, again = _register(setup, state, frame, candidate, motion, turn)
         if isinstance(again, RejectedMatch):
             break
         match = again
     return state, match
+
+
+def _shows_shear(match: Match) -> bool:
+    """Whether a frame is sheared by another velocity than the one that was taken out of it.
+
+    Where it is not, what is far from where it was expected is there by a move between the frames, as of a stage.
+    """
+    shear_px = match.registration.alignment.joint_px[2:]
+    variance = match.registration.alignment.joint_covariance[2:, 2:]
+    if not np.all(np.isfinite(shear_px)):
+        return False
+    return float(shear_px @ solve_scaled(variance, shear_px)) > INNOVATION_CHI2_MAX
+
+
+def _is_known(drift: DriftState, removed: Array, frame: ScanFrame) -> bool:
+    """Whether a velocity is well known, or at least better than it differs from the one that was taken out of a frame.
+
+    After a move that may have been a jump or a drift, it is not: what lies beside the middle line would be found off by
+    its error.
+    """
+    if frame.timing is None:
+        return True
+    change, covariance = drift.velocity - removed[:2], drift.covariance[2:4, 2:4]
+    in_px = frame.px_from_unit @ covariance @ frame.px_from_unit.T
+    sheared_px = frame.timing.frame_time_s * np.sqrt(np.max(np.diag(in_px)))
+    if sheared_px < KNOWN_SHEAR_PX:
+        return True
+    return float(change @ solve_scaled(covariance, change)) > INNOVATION_CHI2_MAX
 
 
 def _register(

@@ -802,6 +802,11 @@ SHEAR_LEFT_PX = TABLE.stated(
     "SHEAR_LEFT_PX", 0.1, "px",
     "That a wrong velocity leaves in a frame, from which another registration is worth its time.",
 )
+KNOWN_SHEAR_PX = TABLE.stated(
+    "KNOWN_SHEAR_PX", 1.0, "px",
+    "1-sigma of the shear by a velocity up to which it is taken out of a frame anyway: at the edge of the image, half "
+    "of it is left.",
+)
 SHEAR_MAX = TABLE.stated(
     "SHEAR_MAX", 0.1, "of the height of the image",
     "By which drift may shear it; more is a stage that moves.",

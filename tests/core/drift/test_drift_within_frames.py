@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
@@ -335,3 +336,41 @@ def test_the_stated_uncertainty_of_averaged_passes_is_honest() -> None:
         stated.append(float(np.median([sigma for _, sigma in found])))
     # Four times the passes: half of the noise.
     assert stated[1] == pytest.approx(0.5 * stated[0], rel=0.15)
+
+
+def _view_of_cluster(at: tuple[float, float], time_s: float, frame_s: float, jump: Any) -> Any:
+    """Particles that lie together, each pixel where they are at its own time; ``jump`` is that of the stage."""
+    size, rng = 256, np.random.default_rng(3)
+    y, x = np.mgrid[0.0:size, 0.0:size]
+    now = time_s + frame_s * (y + x / size) / size
+    picture = np.full((size, size), 55.0)
+    for _ in range(14):
+        left, top = at + rng.uniform(-22.0, 22.0, 2)
+        left, top = left + jump[0] + CLUSTER_SPEED[0] * now, top + jump[1] + CLUSTER_SPEED[1] * now
+        sharp = (rng.uniform(3.0, 7.0) - np.hypot(x - left, y - top)) / 1.2
+        picture += rng.uniform(40.0, 90.0) * ndtr(sharp)
+    noise = 10.0 * np.random.default_rng(int(time_s)).normal(size=picture.shape)
+    return np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
+
+
+CLUSTER_SPEED = np.array([0.7, -0.4])
+
+
+@pytest.mark.parametrize(
+    ("at", "jump"),
+    [((160.0, 70.0), (-45.0, 30.0)), ((90.0, 190.0), (40.0, -35.0)), ((128.0, 60.0), (50.0, 20.0))],
+)
+def test_a_stage_that_moves_between_frames_gives_no_velocity(
+    at: tuple[float, float], jump: tuple[float, float]
+) -> None:
+    """Particles beside the middle line show no shear: a velocity of 13 px per frame moved them by up to 4 px."""
+    tracker = DriftTracker()
+    after = []
+    for k in range(12):
+        moved = np.array(jump) * (k >= 6)
+        image = _view_of_cluster(at, float(k), 0.9, moved)
+        update = tracker.update(image, float(k), None, ScanTiming(0.9))
+        if k >= 6 and update.accepted:
+            after.append(update.drift_m - CLUSTER_SPEED * k - moved)
+    assert len(after) >= 3
+    assert np.max(np.abs(after)) < 0.6
