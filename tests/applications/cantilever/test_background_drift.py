@@ -88,8 +88,11 @@ def test_drift_beside_a_wide_beam(first_look: bool, monkeypatch: pytest.MonkeyPa
     times_s = [20.0 * k for k in range(len(frames))]
     path = follow_background(frames, times_s, plane, axis, 12.0 * plane.pixel_m).path
     assert path.trusted.all(), [u.reason for u in path.updates]
-    # The contrast is as large as the noise, and a third of the image counts.
-    np.testing.assert_allclose(path.drift_px, drift_px, atol=0.12)
+    # The contrast is as large as the noise, and a third of the image counts: 0.07 px RMS along y over eight seeds, 1.2
+    # stated sigmas.
+    np.testing.assert_allclose(path.drift_px, drift_px, atol=0.2)
+    sigma_px = np.array([update.sigma_px for update in path.updates])
+    assert np.all(np.abs(path.drift_px - drift_px)[1:] < 4.0 * sigma_px[1:])
 
 
 @pytest.mark.parametrize(
