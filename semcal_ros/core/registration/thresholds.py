@@ -744,6 +744,11 @@ GRADIENT_ENERGY_MIN = TABLE.stated(
     "Of the gradient that constants leave: ramps of gain and offset that explain away more than the rest are not "
     "used.",
 )
+USUAL_RAMP = TABLE.stated(
+    "USUAL_RAMP", 0.05, "of the gain",
+    "By which it may change from the middle to the edge of the field from frame to frame: ramps that are not told to "
+    "that are not used, since they would make a shift uncertain and hardly wrong.",
+)
 GAIN_RCOND = TABLE.stated(
     "GAIN_RCOND", 1e-9, "of the largest eigenvalue",
     "Below which an eigenvalue of the normal equations of gain and offset is rounding: sums of single-precision "

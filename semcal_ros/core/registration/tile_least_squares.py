@@ -26,12 +26,14 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from semcal_ros.core.arrays import Array, invert_scaled
+from semcal_ros.core.registration.noise_spectrum import shared_pixels
 from semcal_ros.core.registration.thresholds import (
     DETERMINANT_MIN,
     GAIN_RCOND,
     GRADIENT_ENERGY_MIN,
     HELD_INFORMATION,
     RAMPS_KEPT,
+    USUAL_RAMP,
 )
 from semcal_ros.core.registration.tiles import PyramidLevel, TileSums, TileWindow
 
@@ -46,7 +48,8 @@ class TileGeometry:
         (n, 4, 4) normal matrices of the tiles, as in :class:`.tiles.PyramidLevel`, without the noise of the levels.
     ramps
         (n, p) factors of the p terms of gain and offset: a constant and two ramps, or the constant
-        alone where the ramps would explain away most of the gradient, as for a lone particle.
+        alone where the ramps would explain away most of the gradient, as for a lone particle, or the
+        noise leaves them uncertain.
     inverse
         (2 p, 2 p) inverse of the normal equations of gain and offset.
     projection
@@ -143,7 +146,11 @@ def _compute_geometry(
     lost = with_ramps.gradient_share**2 * energy < (
         GRADIENT_ENERGY_MIN * constant.gradient_share**2 * energy
     )
-    return constant if np.any(lost) else with_ramps
+    # Both images have the noise, of which smoothing makes neighbours alike.
+    noise = 2.0 * level.noise_variance * shared_pixels(level.sigma_px)
+    ramps_of_gain = with_ramps.inverse[1:3, 1:3]
+    untold = noise * np.linalg.eigvalsh(ramps_of_gain)[-1] > USUAL_RAMP**2
+    return constant if untold or np.any(lost) else with_ramps
 
 
 @lru_cache(maxsize=RAMPS_KEPT)

@@ -211,7 +211,7 @@ def test_a_tool_at_rest_from_the_first_frame_on_is_not_followed() -> None:
 
 def test_a_tool_at_rest_over_particles_in_the_middle_is_not_followed() -> None:
     """They lie together, where those of a tool may; but they are inside the image, and many."""
-    accepted, wrong = 0, 0
+    accepted, wrong, found = 0, 0, 0
     for seed in range(4):
         tracker = DriftTracker()
         for k in range(25):
@@ -221,11 +221,10 @@ def test_a_tool_at_rest_over_particles_in_the_middle_is_not_followed() -> None:
             accepted += update.accepted
             off = np.abs(update.drift_px - truth)
             wrong += bool(np.any((off > 0.1) & (off > 4.0 * update.sigma_px)))
-        # Followed, it was off by 11 px here.
-        assert not update.accepted or np.all(off < 0.15)
-    # Followed, it was wrong in half of the frames. In one of the first it may still pull; where either may be the
-    # specimen, a frame is refused.
-    assert wrong <= 1 and accepted >= 70
+        found += bool(np.all(off < 0.15))
+    # Followed, it was wrong in half of the frames, and off by 11 px in the end. In one of the first it may still pull;
+    # where either may be the specimen, frames are refused, and the drift that is known after that is uncertain.
+    assert wrong <= 1 and accepted >= 70 and found >= 2
 
 
 def test_lines_that_end_beside_other_bodies_tell_no_shift_across_them() -> None:
