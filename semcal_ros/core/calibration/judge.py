@@ -287,8 +287,8 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
         findings.append(
             Finding(
                 f"scale: neighbouring corners are off alike, by {excess_px:.2g} px, in each view otherwise, so that "
-                f"each counts as uncertain by {each_px:.2g} px: by charging, a drift that changes within an image, or "
-                "a grid that is not flat. Let stage and lenses settle, scan faster, or record more views",
+                f"each counts as uncertain by {each_px:.2g} px: by charging, by a drift that changes within an image, "
+                "or since the grid is not regular. Let stage and lenses settle, scan faster, or record more views",
                 excess_px,
                 magnification=excess_at,
             )

@@ -79,7 +79,7 @@ def nothing(v, xy):
     return np.zeros_like(xy)
 
 
-@pytest.mark.parametrize("views", [2, 3, 12])
+@pytest.mark.parametrize("views", [2, 6, 12])
 def test_independent_corners_stay_as_they_are(views):
     """By chance one recording in a thousand is not; 400 show none or one, and three once in 10 000 times."""
     rng = np.random.default_rng(0)

@@ -68,13 +68,15 @@ def track(kind: str, velocity: Array, seed: int, frames: int = 16) -> list[OwnMo
     """All measurements of one scene, 0.5 s between the frames."""
     tracker = DriftTracker()
     found: list[OwnMotion] = []
+    refused: list[str] = []
     for k in range(frames):
         update = tracker.update(picture(kind, velocity, k, seed), 0.5 * k)
-        assert update.accepted, update.reason
+        refused += [] if update.accepted else [update.reason]
         own = update.own_motion
         if own is not None and (not found or own.end_s > found[-1].end_s):
             assert update.moving is not None
             found.append(own)
+    assert len(refused) <= 1, refused
     return found
 
 

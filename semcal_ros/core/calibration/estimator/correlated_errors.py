@@ -58,6 +58,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     SHARED_CORNERS,
     SHARED_DEGREE,
     SHARED_FALSE_ALARMS,
+    SHARED_PAIRS_MIN,
 )
 
 
@@ -209,7 +210,7 @@ def estimate_shared_excess_px(setup: Setup, problem: Problem, result: BundleResu
     both, does not count; nor does what moves lines along x. The median over the pairs of views lets single views be
     wrong.
 
-    It fails where there are fewer than some thirty corners in a view, and with errors that are the same in all images.
+    It fails with fewer than six views, or some thirty corners in each, and with errors that are the same in all images.
     What changes within a fifth of the image passes for independent.
 
     Parameters
@@ -228,7 +229,7 @@ def estimate_shared_excess_px(setup: Setup, problem: Problem, result: BundleResu
         return 0.0
     bends = [_bend(setup, problem, result, part) for part in _views(problem)]
     pairs = [(a, b) for a, b in pairwise(bends) if a is not None and b is not None]
-    if not pairs:
+    if len(pairs) < SHARED_PAIRS_MIN:
         return 0.0
     found = np.empty((len(pairs), 2))
     for k, (a, b) in enumerate(pairs):

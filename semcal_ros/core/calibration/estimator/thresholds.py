@@ -318,6 +318,10 @@ SHARED_CONDITION = TABLE.stated(
     "SHARED_CONDITION", 1e-6, "of the largest eigenvalue",
     "Below which corners in a part of the image do not tell the polynomials apart.",
 )
+SHARED_PAIRS_MIN = TABLE.derived(
+    "SHARED_PAIRS_MIN", 5, "pairs of views",
+    "Whose median is that of right ones where one view is wrong, which is in two of them.",
+)
 SHARED_FALSE_ALARMS = TABLE.defined(
     "SHARED_FALSE_ALARMS", 1e-3, "chance",
     "With which corners that are independent are made more uncertain.",
