@@ -119,7 +119,7 @@ def test_a_rotation_is_in_the_table_and_in_the_notes(tmp_path):
     found, sigma = (float(rows[-1][name]) for name in ("rotation_rad", "sigma_rotation_rad"))
     assert abs(found - np.deg2rad(1.8)) < 4.0 * sigma < 0.01
     assert abs(float(rows[-1]["log_scale"])) < 4.0 * float(rows[-1]["sigma_log_scale"])
-    assert f"the image turned by {np.rad2deg(found):.3f}"[:-1] in track.notes[-1]
+    assert f"the image turned by {np.rad2deg(found):.4f} +- " in track.notes[-1]
 
 
 def test_live_drift_is_without_hindsight(frames):

@@ -41,7 +41,7 @@ from semcal_ros.core.calibration.method_fit import Finding, MethodFit, make_mode
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.solve import JointFit, without_magnification
 from semcal_ros.core.calibration.thresholds import GRID_STRETCH_MAX, MISFIT_MAX
-from semcal_ros.core.calibration.views import GridView, RejectedView, show_lines
+from semcal_ros.core.calibration.views import GridView, RejectedView, median_sigma_px, show_lines
 from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
     ScaleSigma,
@@ -278,7 +278,7 @@ def describe_fit(setup: Setup, fit: JointFit) -> MethodFit:
     adjustment, result = fit.adjustment, fit.adjustment.result
     factor = variance_factor(adjustment.problem, result)
     findings = []
-    own_px = float(np.median(np.concatenate([v.sigma_px for v in setup.views])))
+    own_px = median_sigma_px(setup.views)
     # By scores: a few outliers are no misfit of functions.
     misfit = np.sqrt(factor) * np.hypot(1.0, fit.excess_px / own_px)
     excess_px, excess_at = measure_excess(setup, fit)

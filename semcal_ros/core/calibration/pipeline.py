@@ -176,7 +176,7 @@ def calibrate_views(
         joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
         contradiction = _find_contradicted_stage(views, setup) or _find_mirrored_beam(setup, joint)
         if not contradiction:
-            joint, setup, told = _fit_without_window_bias(joint, setup, options, on_stage)
+            joint, setup, told = _fit_with_corner_errors(joint, setup, options, on_stage)
             notes += [*told, *_find_turned_axis(views, setup, joint), *lines]
             return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
     except CalibrationError as error:
@@ -195,7 +195,7 @@ def calibrate_views(
     try:
         setup, factor = _prepare(bare, image_size, display_width_m, options, priors)
         joint, setup, outliers, notes = _fit_without_outliers(setup, options, on_stage)
-        joint, setup, told = _fit_without_window_bias(joint, setup, options, on_stage)
+        joint, setup, told = _fit_with_corner_errors(joint, setup, options, on_stage)
         notes += [*told, *contradiction, *_find_turned_axis(views, setup, joint), *lines]
         return _conclude(setup, factor, options, joint, outliers, notes, on_stage)
     except CalibrationError as error:
@@ -411,15 +411,16 @@ def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> t
     return breaks
 
 
-def _fit_without_window_bias(
+def _fit_with_corner_errors(
     joint: JointFit,
     setup: Setup,
     options: CalibrationOptions,
     on_stage: Callable[[str, float], None],
 ) -> tuple[JointFit, Setup, list[Finding]]:
-    """Fit again with what neighbouring corners share, and until the bias by the scan within their windows is taken out.
+    """Fit again with the errors of corners that only a fit tells: what neighbouring ones share, and their bias.
 
-    Only a fit tells the bias. It is some tenths of a pixel at most, by which no view is left out.
+    That by the scan within their windows is taken out until it no longer changes. It is some tenths of a pixel at most,
+    by which no view is left out.
     """
     if joint.shared_px > 0.0:
         # Views that are wrong have been left out.

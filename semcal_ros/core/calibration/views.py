@@ -428,6 +428,11 @@ def estimate_excess_sigma_px(
     return float(np.sqrt(brentq(surplus, 0.0, float(square.max()) / target + 1e-12)))
 
 
+def median_sigma_px(views: Sequence[GridView]) -> float:
+    """Return the median 1-sigma of the corners of all views, per axis in px."""
+    return float(np.median(np.concatenate([view.sigma_px for view in views])))
+
+
 def add_excess_noise(views: Sequence[GridView], sigma_px: float) -> tuple[GridView, ...]:
     """Return the views with corners that are more uncertain by ``sigma_px`` per axis."""
     return tuple(view.add_excess_noise(sigma_px) for view in views)

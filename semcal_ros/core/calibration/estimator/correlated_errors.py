@@ -21,7 +21,7 @@ the residuals between lines, which is estimated from their products.
 *Bends*: charging, a drift within the image that does not go on evenly, or a lens that creeps while it is scanned
 displace neighbouring corners alike, in each image otherwise. Left to least squares, a tenth of a pixel of these passes
 for the perspective of other tilts, and lattices and drifts of ten times their usual size make room for them. So every
-corner is made as uncertain as many independent ones would have to be for their mean over a region to scatter as much.
+corner is made as uncertain as independent ones would have to be for images to be bent as much by chance.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     SHARED_FALSE_ALARMS,
     SHARED_PAIRS_MIN,
 )
+from semcal_ros.core.calibration.views import median_sigma_px
 
 
 @dataclass(frozen=True)
@@ -243,8 +244,7 @@ def estimate_shared_excess_px(setup: Setup, problem: Problem, result: BundleResu
     independent = MEDIAN_FREEDOM * freedom * len(pairs)
     if ratio <= below * float(chdtri(independent, SHARED_FALSE_ALARMS)) / independent:
         return 0.0
-    own_px = float(np.median(np.concatenate([view.sigma_px for view in setup.views])))
-    return float(np.sqrt(max(variance / below - own_px**2, 0.0)))
+    return float(np.sqrt(max(variance / below - median_sigma_px(setup.views) ** 2, 0.0)))
 
 
 @dataclass(frozen=True)

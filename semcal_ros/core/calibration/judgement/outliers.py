@@ -195,10 +195,9 @@ def find_change(
         if abs(size) > highest * sigma:
             highest = abs(size) / sigma
             best, gained = (k, size, sigma), float(size**2 * information)
-    bends = np.linalg.qr(scales.whiten(further) - basis @ (basis.T @ scales.whiten(further)))[0]
-    if best is not None and np.sum((bends.T @ left) ** 2) > gained:
-        return None
-    return best
+    more = scales.whiten(further)
+    bends = np.linalg.qr(more - basis @ (basis.T @ more))[0]
+    return None if np.sum((bends.T @ left) ** 2) > gained else best
 
 
 def _free_scales(setup: Setup, adjustment: Adjustment) -> FreeScales:

@@ -62,6 +62,7 @@ from semcal_ros.core.calibration.start import (
 from semcal_ros.core.calibration.views import (
     GridView,
     estimate_excess_sigma_px,
+    median_sigma_px,
     refuse_tilted_lines,
 )
 from semcal_ros.core.calibration.window_bias import flatten_view
@@ -283,7 +284,7 @@ def revise(
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
     result = adjust(problem, State(theta, poses.rotations, poses.translations_m))
-    own_px = float(np.median(np.concatenate([view.sigma_px for view in setup.views])))
+    own_px = median_sigma_px(setup.views)
     shared_px = estimate_shared_excess_px(setup, problem, result)
     if shared_px > 0.0:
         setup = with_excess(setup, shared_px)
