@@ -35,12 +35,13 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Indices, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
-    SMOOTH,
+    DECENTRING,
     Adjustment,
     BundleResult,
     refine,
     refit_functions,
     residual_variance,
+    smooth_names,
 )
 from semcal_ros.core.calibration.estimator.poses import adjust_with_other_poses, refine_coarsely
 from semcal_ros.core.calibration.estimator.problem import (
@@ -409,15 +410,17 @@ def select_and_adjust(
     spread: VarianceComponents,
     sizes: Mapping[str, tuple[str, int]] | None = None,
     *,
-    always: Sequence[str] = SMOOTH,
+    always: Sequence[str] | None = None,
     choose_terms: bool = True,
 ) -> Adjustment:
     """Choose the number of coefficients of every function, and further terms of the camera but for the
     :data:`LATE_TERMS`, until the choice no longer changes.
 
+    The functions ``always`` are never removed; by default they are those of :func:`smooth_names`.
     Products that are there stay. Beside a residual field the terms stay as they are, since it takes the place of those
     that are not there.
     """
+    always = smooth_names(functions) if always is None else always
     always = (*always, *(name for name in LATE_TERMS if name in functions))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
@@ -425,7 +428,8 @@ def select_and_adjust(
     converged, rounds = False, 0
     terms: tuple[str, ...] = ()
     if choose_terms and not setup.priors.is_wide:
-        terms = tuple(name for name in TERM_NAMES if name not in (*always, *LATE_TERMS))
+        offered = dict.fromkeys((*DECENTRING, *TERM_NAMES))
+        terms = tuple(name for name in offered if name not in (*always, *LATE_TERMS))
     while rounds < CHOICE_ROUNDS and not converged:
         rounds += 1
         every = build_problem(setup, functions, setup.views, spread, candidates=(*always, *terms))
@@ -447,7 +451,7 @@ def select_and_adjust(
 
 
 def add_late_terms(
-    setup: Setup, adjustment: Adjustment, *, always: Sequence[str] = SMOOTH
+    setup: Setup, adjustment: Adjustment, *, always: Sequence[str] | None = None
 ) -> Adjustment:
     """Return the adjustment with those :data:`LATE_TERMS` that explain what it leaves; unchanged where none does.
 
@@ -462,7 +466,7 @@ def add_late_terms(
 
 
 def _add_terms(
-    setup: Setup, adjustment: Adjustment, names: Sequence[str], always: Sequence[str]
+    setup: Setup, adjustment: Adjustment, names: Sequence[str], always: Sequence[str] | None
 ) -> Adjustment:
     functions, spread = adjustment.functions, adjustment.spread
     offered = [name for name in names if name not in functions]
@@ -551,7 +555,7 @@ def _add_field(
 
 def _current_sizes(adjustment: Adjustment) -> dict[str, tuple[str, int]]:
     own = adjustment.functions
-    return {name: (own[name].kind, own[name].smooth_size) for name in SMOOTH}
+    return {name: (own[name].kind, own[name].smooth_size) for name in smooth_names(own)}
 
 
 def _readjust(setup: Setup, adjustment: Adjustment, theta: Array, *, choosing: bool) -> Adjustment:
@@ -618,7 +622,7 @@ def select(started: Start, residual: str) -> Selection:
             # What the products stood for is a part of what the field describes, which has them among its patterns.
             # Where there is no solution without them, they stay.
             with suppress(UnusableCalibrationError):
-                first = _add_terms(*plain, ("xi_r4",), SMOOTH)
+                first = _add_terms(*plain, ("xi_r4",), None)
                 instead = _add_field(plain[0], first, always=True)
                 if instead[1] is not None:
                     adjustment, field, pattern = instead

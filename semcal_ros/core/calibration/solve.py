@@ -23,7 +23,6 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
-    SMOOTH,
     SMOOTH_AT_LAST,
     Adjustment,
     refine,
@@ -59,7 +58,6 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
 from semcal_ros.core.calibration.estimator.thresholds import (
     DAMPING_MIN,
     NAMED_MAX,
-    USUAL_LATTICES,
 )
 from semcal_ros.core.calibration.estimator.variance_components import (
     accelerate_components,
@@ -154,7 +152,7 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment, *, usual_spreads: bool
         )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
-        after = update_components(setup, problem, result, usual_lattices=USUAL_LATTICES)
+        after = update_components(setup, problem, result)
         after = limit_components(setup, after) if usual_spreads else after
         updates.append((spread, after))
         if largest_change(*updates[-1]) < SPREAD_CHANGE:
@@ -216,8 +214,8 @@ def solve(
         adjustment.functions,
         adjustment.result.state,
         spread,
+        always=SMOOTH_AT_LAST,
         # A field takes the place of what is not there.
-        always=SMOOTH_AT_LAST if field is None else SMOOTH,
         choose_terms=field is None,
     )
     if field is None:

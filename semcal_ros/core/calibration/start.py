@@ -30,7 +30,11 @@ import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Mask
 from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
-from semcal_ros.core.calibration.estimator.bundle_adjustment import SMOOTH, refit_functions
+from semcal_ros.core.calibration.estimator.bundle_adjustment import (
+    DECENTRING,
+    refit_functions,
+    smooth_names,
+)
 from semcal_ros.core.calibration.estimator.poses import (
     adjust,
     initial_values,
@@ -61,7 +65,11 @@ from semcal_ros.core.calibration.thresholds import (
     UNTILTED_RAD,
 )
 from semcal_ros.core.calibration.views import GridView, add_excess_noise
-from semcal_ros.core.camera.calibration_model import stack_coefficients, with_coefficients
+from semcal_ros.core.camera.calibration_model import (
+    FUNCTION_NAMES,
+    stack_coefficients,
+    with_coefficients,
+)
 from semcal_ros.core.camera.plane_geometry import fit_homography, view_affine
 from semcal_ros.core.errors import CalibrationError, InvalidValueError, UnusableCalibrationError
 from semcal_ros.core.wording import format_length
@@ -339,12 +347,25 @@ def tempered(setup: Setup, sigma_px: float) -> Setup:
     return replace(noisy, tempering=float(np.median(own)) ** -0.5)
 
 
-def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
-    """Fit moderately flexible functions, poses and variance components from nominal values."""
+@dataclass(frozen=True)
+class _FirstFit:
+    functions: Functions
+    state: State
+    spread: VarianceComponents
+    cost: float
+
+
+def _fit_start(setup: Setup, decentring: str) -> _FirstFit:
+    """Fit moderately flexible functions, poses and variance components from nominal values.
+
+    Of :data:`DECENTRING`, the functions have that along one diagonal.
+    """
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     rho = start.rho if start.wide else min(max(start.rho, 0.0), START_RHO_MAX)
-    functions: Functions = constant_functions(setup, {"scale": start.scale_factor, "rho": rho})
+    names = [name for name in FUNCTION_NAMES if name not in DECENTRING]
+    values = {"scale": start.scale_factor, "rho": rho}
+    functions: Functions = constant_functions(setup, values, [*names, decentring])
     spread = initial_components(setup)
     problem = build_problem(setup, functions, setup.views, spread)
     theta = np.concatenate([stack_coefficients(functions), setup.shared_start()])
@@ -352,18 +373,21 @@ def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
     state, _ = resolve_mirrored_tilts(problem, state)
 
     size = min(3, max(1, len(setup.magnifications) - 1))
-    functions = refit_functions(functions, dict.fromkeys(SMOOTH, ("chebyshev_log", size)))
+    smooth = smooth_names(functions)
+    functions = refit_functions(functions, dict.fromkeys(smooth, ("chebyshev_log", size)))
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result = adjust(problem, state, tolerance=COARSE_TOLERANCE)
     result = right_way_up(setup, functions, problem, result)
+    cost = result.cost
     for _ in range(FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the
         # scale.
         spread = update_components(setup, problem, result)
         problem = build_problem(setup, functions, setup.views, spread)
         result = refine_coarsely(problem, result.state)
-    return with_coefficients(functions, result.state.theta), result.state, spread
+    functions = with_coefficients(functions, result.state.theta)
+    return _FirstFit(functions, result.state, spread, cost)
 
 
 @dataclass(frozen=True)
@@ -395,4 +419,6 @@ def start(setup: Setup) -> Start:
         # What a stage says wrongly must not lead poses astray that are so uncertain.
         noisy = replace(noisy, tempering=np.inf)
     thin = replace(noisy, views=tuple(thin_view(v) for v in noisy.views))
-    return Start(setup, noisy, *_fit_start(thin))
+    fits = (_fit_start(thin, decentring) for decentring in DECENTRING)
+    best = min(fits, key=lambda fit: fit.cost)
+    return Start(setup, noisy, best.functions, best.state, best.spread)

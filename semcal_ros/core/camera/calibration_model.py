@@ -105,7 +105,7 @@ def design_matrix(
     known: dict[object, Array] = {}
     columns = columns_of(functions)
     if rows is None:
-        rows = FUNCTION_NAMES if len(columns) == len(FUNCTION_NAMES) else ALL_FUNCTIONS
+        rows = FUNCTION_NAMES if set(columns) == set(FUNCTION_NAMES) else ALL_FUNCTIONS
     place = {name: row for row, name in enumerate(rows)}
     matrix = np.zeros((len(rows), sum(functions[name].size for name in columns)))
     for name, own in columns.items():

@@ -24,7 +24,6 @@ import numpy as np
 from semcal_ros.core.arrays import Array, Indices, equilibrate, invert_scaled, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
-    SMOOTH,
     SMOOTH_AT_LAST,
     Adjustment,
     BundleResult,
@@ -173,7 +172,7 @@ class PaddedAdjustment:
 def pad(setup: Setup, adjustment: Adjustment) -> PaddedAdjustment:
     """Return the adjustment with a few more coefficients; ``setup`` has the views that it was made of."""
     # What a further term may do besides is a residual field's, where there is one.
-    names = SMOOTH if setup.corrected else PADDED
+    names = SMOOTH_AT_LAST if setup.corrected else PADDED
     functions = _pad_functions(adjustment.functions, names)
     problem = build_problem(setup, functions, setup.views, adjustment.spread)
     state = adjustment.result.state

@@ -474,7 +474,9 @@ def prior_vectors(setup: Setup, functions: Functions) -> tuple[Array, Array]:
     return np.concatenate([m for m, _ in parts]), np.concatenate([s for _, s in parts])
 
 
-def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, ContinuousFunction]:
+def constant_functions(
+    setup: Setup, values: Mapping[str, float], names: Sequence[str] = FUNCTION_NAMES
+) -> dict[str, ContinuousFunction]:
     """Make functions that do not depend on the magnification, except for their jumps."""
     g_range = (float(setup.magnifications[0]), float(setup.magnifications[-1]))
     return {
@@ -486,7 +488,7 @@ def constant_functions(setup: Setup, values: Mapping[str, float]) -> dict[str, C
             g_range,
             breaks=setup.breaks_of(name),
         )
-        for name in FUNCTION_NAMES
+        for name in names
     }
 
 
