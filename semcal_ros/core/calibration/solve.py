@@ -58,6 +58,7 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
 from semcal_ros.core.calibration.estimator.thresholds import (
     DAMPING_MIN,
     NAMED_MAX,
+    USUAL_LATTICES,
 )
 from semcal_ros.core.calibration.estimator.variance_components import (
     accelerate_components,
@@ -152,7 +153,7 @@ def _adjust_exactly(setup: Setup, adjustment: Adjustment, *, usual_spreads: bool
         )
         result = right_way_up(setup, functions, problem, result)
         state = result.state
-        after = update_components(setup, problem, result)
+        after = update_components(setup, problem, result, usual_lattices=USUAL_LATTICES)
         after = limit_components(setup, after) if usual_spreads else after
         updates.append((spread, after))
         if largest_change(*updates[-1]) < SPREAD_CHANGE:

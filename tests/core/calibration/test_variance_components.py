@@ -28,6 +28,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     VarianceComponents,
     usual_lattice_sigmas,
 )
+from semcal_ros.core.calibration.estimator.thresholds import USUAL_LATTICES
 from semcal_ros.core.calibration.estimator.variance_components import (
     _drift_sigma,
     _lattice_sigma,
@@ -129,7 +130,7 @@ def lattice_spread(true: float, known: float, rng: np.random.Generator) -> float
         left = 1.0 / (1.0 + (sigma / (usual * known)) ** 2)
         found = {"lattice": -(1.0 - left) * seen / sigma}
         result = _Result(found, {"lattice": np.broadcast_to(left, seen.shape)}, np.zeros((0, 2)))
-        sigma = _lattice_sigma(sigma, result, Priors())  # type: ignore[arg-type,assignment]
+        sigma = _lattice_sigma(sigma, result, Priors(), USUAL_LATTICES)  # type: ignore[arg-type,assignment]
     return float(sigma[0] / usual[0])
 
 

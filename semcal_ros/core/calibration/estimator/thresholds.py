@@ -199,7 +199,7 @@ USUAL_WEIGHT = TABLE.measured(
 )
 USUAL_LATTICES = TABLE.defined(
     "USUAL_LATTICES", 1.0, "effects",
-    "Weight of the usual stretch or shear of lattices against one that is observed: one lattice.",
+    "Of a stretch or shear of lattices for which the usual spread counts against a larger one: one lattice.",
 )
 SPREAD_MIN = TABLE.measured(
     "SPREAD_MIN", 0.01, "of the usual spread",

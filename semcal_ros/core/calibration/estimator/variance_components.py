@@ -48,30 +48,32 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     SPREAD_MEMORY,
     SPREAD_MIN,
     SPREAD_STEP_MAX,
-    USUAL_LATTICES,
     USUAL_WEIGHT,
 )
 
 
 def _update(
-    sigma: float, usual: float, residuals: Array, variance: Array, weight: float = USUAL_WEIGHT
+    sigma: float, usual: float, residuals: Array, variance: Array, beyond: float = USUAL_WEIGHT
 ) -> Spread:
     """Update a spread from the residuals of its prior, in sigmas, and their posterior variances.
 
-    The usual spread counts as so many observed effects as ``weight``.
+    The usual spread counts as :data:`USUAL_WEIGHT` observed effects, and as ``beyond`` of them for a larger one.
     """
     known_part = np.maximum(1.0 - variance, 0.0)
     determined = float(np.sum(known_part))
     # The information of the data on an effect is (1 / variance - 1) / sigma^2.
     visible = float(np.sum(known_part / (known_part + variance * (sigma / usual) ** 2)))
     seen = sigma**2 * float(np.sum(residuals**2))
-    square = (seen + weight * usual**2) / (determined + weight)
+    known = beyond if seen > determined * usual**2 else USUAL_WEIGHT
+    square = (seen + known * usual**2) / (determined + known)
     return Spread(
         float(np.clip(np.sqrt(square), SPREAD_MIN * usual, SPREAD_MAX * usual)), determined, visible
     )
 
 
-def update_components(setup: Setup, problem: Problem, result: BundleResult) -> VarianceComponents:
+def update_components(
+    setup: Setup, problem: Problem, result: BundleResult, *, usual_lattices: float = USUAL_WEIGHT
+) -> VarianceComponents:
     """Update all spreads from an adjustment with the ones before.
 
     Views without tilt have a spread of heights of their own: tilting moves the specimen, while
@@ -81,8 +83,11 @@ def update_components(setup: Setup, problem: Problem, result: BundleResult) -> V
     usual: it would be the distortion that the model does not have yet. Nor is it where a residual field has been taken
     off: what a field of limited strength leaves would pass for drift and for lattices that are stretched, by so much
     that tilts make room for them.
+
+    ``usual_lattices`` is for how many lattices the usual spread of them counts against a larger one. A tilt does nearly
+    what a stretch does, so that many views may say a little each; repeated updates follow even that.
     """
-    found = _updated_components(setup, problem, result)
+    found = _updated_components(setup, problem, result, usual_lattices)
     limited = setup.corrected or setup.tempering != 1.0
     return limit_components(setup, found) if limited else found
 
@@ -151,7 +156,9 @@ def _with_log_sigmas(components: VarianceComponents, logarithms: Array) -> Varia
     )
 
 
-def _updated_components(setup: Setup, problem: Problem, result: BundleResult) -> VarianceComponents:
+def _updated_components(
+    setup: Setup, problem: Problem, result: BundleResult, usual_lattices: float
+) -> VarianceComponents:
     priors = setup.priors
     flat: Mask = result.state.rotations[:, 2, 2] > np.cos(FLAT_RAD)
     if min(flat.sum(), (~flat).sum()) < SPREAD_COUNT_MIN:
@@ -188,22 +195,19 @@ def _updated_components(setup: Setup, problem: Problem, result: BundleResult) ->
         visits[1],
         height,
         _drift_sigma(problem, result, setup.drift_sigma_px),
-        _lattice_sigma(effects.lattice_sigma, result, priors),
+        _lattice_sigma(effects.lattice_sigma, result, priors, usual_lattices),
     )
 
 
-def _lattice_sigma(sigma: Array | None, result: BundleResult, priors: Priors) -> Array | None:
-    """Update the spreads of stretches and shears of the views' lattices.
-
-    A tilt does nearly what a stretch does, so that many views may say a little each; repeated updates would follow even
-    that, were the usual spread not worth :data:`USUAL_LATTICES` of them.
-    """
+def _lattice_sigma(
+    sigma: Array | None, result: BundleResult, priors: Priors, beyond: float
+) -> Array | None:
     if sigma is None:
         return None
     residuals, variance = result.prior_residuals["lattice"], result.prior_variance["lattice"]
     return np.array(
         [
-            _update(s, usual, residuals[:, k], variance[:, k], USUAL_LATTICES).sigma
+            _update(s, usual, residuals[:, k], variance[:, k], beyond).sigma
             for k, (s, usual) in enumerate(zip(sigma, usual_lattice_sigmas(priors), strict=True))
         ]
     )
