@@ -78,6 +78,7 @@ from semcal_ros.core.calibration.start import (
     advise_scale,
     align_lattices,
     check_nominal_scale,
+    is_scale_far,
     look_untilted,
     mark_untilted,
     observed_scale_factor,
@@ -249,7 +250,7 @@ def _prepare(
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in ordered]))
     factor = observed_scale_factor(ordered, nominal)
-    _check_scale(setup, factor)
+    check_nominal_scale(factor, **_units(setup))
     if priors is None:
         setup = adapt_priors(setup)
     if ordered[0].across is not None:
@@ -381,23 +382,26 @@ def _units(setup: Setup) -> dict[str, Any]:
     }
 
 
-def _check_scale(setup: Setup, factor: float) -> None:
-    check_nominal_scale(factor, **_units(setup))
-
-
 def _check_converged(setup: Setup, fit: MethodFit, factor: float) -> None:
-    """Refuse a fit that is not at a minimum, or that ended far from the nominal scale."""
-    if fit.failure:
+    """Refuse a fit that is not at a minimum, or that ended far from the nominal scale.
+
+    The images themselves show a scale near it (:func:`_prepare`): where the fit alone left it, nothing follows for the
+    display width.
+    """
+    ended = float(np.median([fit.functions["scale"](g) for g in setup.magnifications]))
+    failure = fit.failure
+    if not failure and is_scale_far(np.array(ended)):
+        failure = f"it ended at {ended:.3g} times the predicted scale"
+    if failure:
         advice = "leave out what are not such views"
         if not 1.0 / SCALE_FACTOR_TOLD < factor < SCALE_FACTOR_TOLD:
             advice += "; " + advise_scale(factor, **_units(setup))
         raise UnusableCalibrationError(
-            f"an adjustment that did not converge ({fit.failure}), where the images show {factor:.3g} "
+            f"an adjustment that did not converge ({failure}), where the images show {factor:.3g} "
             "times the scale that magnification, display width and squares predict",
             expected="views of one flat grid, by one microscope, at the magnifications that are stated",
             do=advice,
         )
-    _check_scale(setup, float(np.median([fit.functions["scale"](g) for g in setup.magnifications])))
 
 
 def _check_breakpoints(breakpoints: Sequence[float], magnifications: Array) -> tuple[float, ...]:
