@@ -29,11 +29,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import MEDIAN_CHI2, Array, Mask
-from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, State
+from semcal_ros.core.calibration.estimator.blocks import GRID_NAMES, MISS_NAMES, Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     DECENTRING,
+    SMOOTH,
+    BundleResult,
     refit_functions,
-    smooth_names,
 )
 from semcal_ros.core.calibration.estimator.poses import (
     adjust,
@@ -347,47 +348,42 @@ def tempered(setup: Setup, sigma_px: float) -> Setup:
     return replace(noisy, tempering=float(np.median(own)) ** -0.5)
 
 
-@dataclass(frozen=True)
-class _FirstFit:
-    functions: Functions
-    state: State
-    spread: VarianceComponents
-    cost: float
-
-
-def _fit_start(setup: Setup, decentring: str) -> _FirstFit:
-    """Fit moderately flexible functions, poses and variance components from nominal values.
-
-    Of :data:`DECENTRING`, the functions have that along one diagonal.
-    """
+def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:
+    """Fit moderately flexible functions, poses and variance components from nominal values."""
     nominal = setup.nominal_px_per_m(np.array([v.magnification for v in setup.views]))
     start = initial_values(setup.views, nominal, setup.centre_px, setup.priors.rho_mean)
     rho = start.rho if start.wide else min(max(start.rho, 0.0), START_RHO_MAX)
     names = [name for name in FUNCTION_NAMES if name not in DECENTRING]
     values = {"scale": start.scale_factor, "rho": rho}
-    functions: Functions = constant_functions(setup, values, [*names, decentring])
+    constants = constant_functions(setup, values, names)
     spread = initial_components(setup)
-    problem = build_problem(setup, functions, setup.views, spread)
-    theta = np.concatenate([stack_coefficients(functions), setup.shared_start()])
+    problem = build_problem(setup, constants, setup.views, spread)
+    theta = np.concatenate([stack_coefficients(constants), setup.shared_start()])
     state = State(theta, start.rotations, start.translations_m)
     state, _ = resolve_mirrored_tilts(problem, state)
 
-    size = min(3, max(1, len(setup.magnifications) - 1))
-    smooth = smooth_names(functions)
-    functions = refit_functions(functions, dict.fromkeys(smooth, ("chebyshev_log", size)))
-    problem = build_problem(setup, functions, setup.views, spread)
-    state = replace(state, theta=stack_theta(setup, functions, state))
-    result = adjust(problem, state, tolerance=COARSE_TOLERANCE)
-    result = right_way_up(setup, functions, problem, result)
-    cost = result.cost
+    fits = [_fit_decentred(setup, constants, state, spread, name) for name in DECENTRING]
+    functions, problem, result = min(fits, key=lambda fit: fit[2].cost)
     for _ in range(FIRST_UPDATES):
         # Before anything is selected: too wide a prior of the heights would let them imitate the
         # scale.
         spread = update_components(setup, problem, result)
         problem = build_problem(setup, functions, setup.views, spread)
         result = refine_coarsely(problem, result.state)
-    functions = with_coefficients(functions, result.state.theta)
-    return _FirstFit(functions, result.state, spread, cost)
+    return with_coefficients(functions, result.state.theta), result.state, spread
+
+
+def _fit_decentred(
+    setup: Setup, constants: Functions, state: State, spread: VarianceComponents, decentring: str
+) -> tuple[Functions, Problem, BundleResult]:
+    """Fit functions that may change moderately, with decentring along one diagonal."""
+    size = min(3, max(1, len(setup.magnifications) - 1))
+    sizes = dict.fromkeys((*SMOOTH, decentring), ("chebyshev_log", size))
+    functions = refit_functions(constants, sizes)
+    problem = build_problem(setup, functions, setup.views, spread)
+    state = replace(state, theta=stack_theta(setup, functions, state))
+    result = adjust(problem, state, tolerance=COARSE_TOLERANCE)
+    return functions, problem, right_way_up(setup, functions, problem, result)
 
 
 @dataclass(frozen=True)
@@ -419,6 +415,4 @@ def start(setup: Setup) -> Start:
         # What a stage says wrongly must not lead poses astray that are so uncertain.
         noisy = replace(noisy, tempering=np.inf)
     thin = replace(noisy, views=tuple(thin_view(v) for v in noisy.views))
-    fits = (_fit_start(thin, decentring) for decentring in DECENTRING)
-    best = min(fits, key=lambda fit: fit.cost)
-    return Start(setup, noisy, best.functions, best.state, best.spread)
+    return Start(setup, noisy, *_fit_start(thin))

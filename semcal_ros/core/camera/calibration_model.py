@@ -21,7 +21,7 @@ scale bar: no distortion, a parallel projection, and the uncertainty of both.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -53,6 +53,11 @@ TERM_NAMES: tuple[str, ...] = ALL_NAMES[len(PARAMETER_NAMES) :]
 def names_of(functions: Mapping[str, ContinuousFunction]) -> tuple[str, ...]:
     """Return the names of the functions that are there, in the order of ``ALL_FUNCTIONS``."""
     return tuple(name for name in ALL_FUNCTIONS if name in functions)
+
+
+def _parameters_of(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the parameters of a camera whose functions have these names."""
+    return FUNCTION_NAMES if set(names) == set(FUNCTION_NAMES) else ALL_FUNCTIONS
 
 
 def columns_of(functions: Mapping[str, ContinuousFunction]) -> dict[str, slice]:
@@ -105,7 +110,7 @@ def design_matrix(
     known: dict[object, Array] = {}
     columns = columns_of(functions)
     if rows is None:
-        rows = FUNCTION_NAMES if set(columns) == set(FUNCTION_NAMES) else ALL_FUNCTIONS
+        rows = _parameters_of(columns)
     place = {name: row for row, name in enumerate(rows)}
     matrix = np.zeros((len(rows), sum(functions[name].size for name in columns)))
     for name, own in columns.items():
@@ -344,9 +349,7 @@ class CalibrationModel:
         distance = abs(float(np.log(g / edge))) / span
         grid = np.geomspace(low, high, 33)
         names = names_of(self.functions)
-        sigma = np.zeros(
-            len(FUNCTION_NAMES if len(names) == len(FUNCTION_NAMES) else ALL_FUNCTIONS)
-        )
+        sigma = np.zeros(len(_parameters_of(names)))
         for name in names:
             values = [self.functions[name](x) for x in grid]
             sigma[ALL_FUNCTIONS.index(name)] = 2.0 * (max(values) - min(values)) * distance
