@@ -23,7 +23,7 @@ Romano, Testing Statistical Hypotheses, chapter 7, has the test of linear hypoth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
@@ -35,10 +35,12 @@ from semcal_ros.core.arrays import Array
 from semcal_ros.core.calibration.estimator.blocks import Problem
 from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.problem import Setup
+from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.calibration.judgement.revision import (
-    CHANGING,
     Revision,
+    changing,
     free_sigmas,
+    gaining,
     make_setup,
     revise,
 )
@@ -46,6 +48,7 @@ from semcal_ros.core.calibration.judgement.thresholds import (
     CELL_VIEWS_MIN,
     CHECK_CELLS,
     CHECK_FALSE_ALARMS,
+    GAIN_MAX,
     MISFIT_SIGMA,
     OTHER_SCALE,
     SIGN_FLIPS,
@@ -55,15 +58,22 @@ from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
 from semcal_ros.core.wording import counted
 
-#: Groups of parameters that are tested together, by the name under which a change is reported.
-CHANGES = {
+_GROUPS = {
     "scale": ("scale",),
     "aspect": ("aspect",),
     "skew": ("skew",),
-    "distortion": ("xi_r", "xi_t"),
+    "distortion": ("xi_r", "xi_t", "xi_u"),
     "centre of distortion": ("ex", "ey"),
 }
+#: The names under which changes are reported.
+CHANGES = tuple(_GROUPS)
 _TESTS = len(CHANGES) + 1
+
+
+def groups_of_changes(model: CalibrationModel) -> dict[str, tuple[str, ...]]:
+    """Return the parameters of a calibration that are tested together, by each of :data:`CHANGES`."""
+    own = changing(model)
+    return {name: tuple(p for p in group if p in own) for name, group in _GROUPS.items()}
 
 
 class Verdict(Enum):
@@ -81,9 +91,10 @@ class Change:
     Attributes
     ----------
     name
-        Key of :data:`CHANGES`.
+        One of :data:`CHANGES`.
     values, sigmas
-        Changes of its parameters with their 1-sigma: relative for the scale, px for the centre.
+        Changes of its parameters (:func:`groups_of_changes`) with their 1-sigma, in the mean over the views: relative
+        for the scale, px for the centre.
     chi2, p_value
         By how much it lowers chi-square, and how probable as much is without a change.
     largest_px, largest_m
@@ -223,13 +234,11 @@ def check_calibration(
         If an untilted view is named that is not there.
     """
     setup = make_setup(model, views, image_size, untilted, axis or StageAxis())
-    revision = revise(model, setup, free_sigmas(setup))
+    revision, estimate, found = _find_changes(model, setup)
     setup, problem, result = revision.setup, revision.problem, revision.result
-    estimate = _estimate_changes(revision)
-    proven = {change.name: change for change in _select(estimate)}
-    given = [parameter for name in proven for parameter in CHANGES[name]]
+    proven = {change.name: change for change in found}
     # What has changed takes part of the rest with it: the rest is tested beside it, and not as if nothing had.
-    beside = [proven.get(name) or _test(estimate, given, name) for name in CHANGES]
+    beside = [proven.get(name) or _test(estimate, list(proven), name) for name in CHANGES]
     tested = tuple(_with_effect(model, setup, change) for change in beside)
     by_name = {change.name: change for change in tested}
     changes, scale = tuple(by_name[name] for name in proven), by_name["scale"]
@@ -287,15 +296,27 @@ def _stated_px(model: CalibrationModel, setup: Setup) -> float:
 
 
 @dataclass(frozen=True)
+class _Group:
+    """The unknowns of a group of changes: (C,) their columns, and the prior 1-sigma of those after the first, of
+    relative changes; (P, C) what they make of its parameters, in the mean over the views.
+    """
+
+    columns: Array
+    relative_sigmas: Array
+    parameters: Array
+
+
+@dataclass(frozen=True)
 class _Estimate:
-    """Estimate of all changes as a Gaussian: its information and score."""
+    """Estimate of all changes as a Gaussian: its information and score, and the unknowns of each group."""
 
     information: Array
     score: Array
+    groups: Mapping[str, _Group]
 
-    def solve(self, names: Sequence[str]) -> tuple[Array, Array, float]:
+    def solve(self, groups: Sequence[str]) -> tuple[Array, Array, float]:
         """Values and covariance of some changes where all others are zero, and the chi-square they explain."""
-        index = [CHANGING.index(name) for name in names]
+        index = [column for name in groups for column in self.groups[name].columns]
         if not index:
             return np.zeros(0), np.zeros((0, 0)), 0.0
         covariance = np.asarray(
@@ -305,25 +326,92 @@ class _Estimate:
         return values, covariance, float(values @ self.score[index])
 
 
+def _find_changes(
+    model: CalibrationModel, setup: Setup
+) -> tuple[Revision, _Estimate, list[Change]]:
+    """Adjust to the views, and find what has changed.
+
+    A distortion that has changed may have done so in proportion to itself. As long as it has to be by the same amount
+    at all magnifications, the rest is taken for a change of its centre.
+    """
+    free = free_sigmas(model, setup)
+    revision = revise(model, setup, free)
+    estimate = _estimate_changes(revision)
+    found = _select(estimate)
+    gains = gain_sigmas(model, setup, found)
+    if gains:
+        other = revise(model, setup, free, gains)
+        estimate_of_other = _estimate_changes(other)
+        again = _select(estimate_of_other)
+        if gain_sigmas(model, setup, again):
+            return other, estimate_of_other, again
+    return revision, estimate, found
+
+
+def gain_sigmas(
+    model: CalibrationModel, setup: Setup, changes: Sequence[Change]
+) -> dict[str, float]:
+    """Return the prior 1-sigma of the relative changes of
+    :func:`~semcal_ros.core.calibration.judgement.revision.gaining`: so large that they could be the whole change that
+    was proven, where the views are.
+
+    Whether the distortion has changed by the same amount at all magnifications or in proportion, views at one of them
+    do not tell.
+    """
+    sigmas, groups = {}, groups_of_changes(model)
+    for change in changes:
+        for name, value in zip(groups[change.name], change.values, strict=True):
+            if name in gaining(model):
+                usual = float(np.sqrt(np.mean(_at_views(model, setup, name) ** 2)))
+                sigmas[name] = min(abs(value) / max(usual, np.finfo(np.float64).tiny), GAIN_MAX)
+    return sigmas
+
+
+def _at_views(model: CalibrationModel, setup: Setup, name: str) -> Array:
+    """(M,) a parameter as calibrated, at the magnifications of the views."""
+    return np.array([model.functions[name](float(g)) for g in setup.magnifications])
+
+
 def _estimate_changes(revision: Revision) -> _Estimate:
-    own = revision.changes
-    information = np.asarray(np.linalg.inv(revision.covariance[own, own]), dtype=np.float64)
-    return _Estimate(information, information @ revision.result.state.theta[own])
+    model, setup = revision.model, revision.setup
+    names, gains = changing(model), gaining(model)
+    own = np.r_[revision.changes, revision.gains]
+    sigmas = revision.problem.prior_sigma[own]
+    free = np.append(np.ones(len(names), dtype=bool), sigmas[len(names) :] > HELD_SIGMA)
+    information = np.zeros((len(own), len(own)))
+    information[np.ix_(free, free)] = np.linalg.inv(
+        revision.covariance[np.ix_(own[free], own[free])]
+    )
+    groups = {}
+    for name, parameters in groups_of_changes(model).items():
+        relative = [p for p in parameters if p in gains and free[len(names) + gains.index(p)]]
+        columns = [names.index(p) for p in parameters]
+        columns += [len(names) + gains.index(p) for p in relative]
+        values = np.eye(len(parameters), len(columns))
+        for column, p in enumerate(relative, start=len(parameters)):
+            values[parameters.index(p), column] = np.mean(_at_views(model, setup, p))
+        groups[name] = _Group(np.array(columns), sigmas[columns[len(parameters) :]], values)
+    return _Estimate(information, information @ revision.result.state.theta[own], groups)
 
 
 def _test(estimate: _Estimate, given: Sequence[str], name: str) -> Change:
     """Test one group of changes where those of other groups are free and the rest is zero."""
-    group = CHANGES[name]
-    values, covariance, explained = estimate.solve([*given, *group])
+    group = estimate.groups[name]
+    values, covariance, explained = estimate.solve([*given, name])
     _, _, before = estimate.solve(given)
     gain = max(explained - before, 0.0)
-    own = slice(len(given), None)
+    own = slice(len(values) - len(group.columns), None)
+    values, covariance = values[own], covariance[own, own]
+    # Of a relative change as much is a degree of freedom as the views tell of it.
+    left = np.diag(covariance)[len(group.parameters) :] / group.relative_sigmas**2
+    freedom = len(group.parameters) + float(np.sum(np.maximum(1.0 - left, 0.0)))
+    sigmas = np.sqrt(np.diag(group.parameters @ covariance @ group.parameters.T))
     return Change(
         name,
-        tuple(values[own].tolist()),
-        tuple(np.sqrt(np.diag(covariance))[own].tolist()),
+        tuple((group.parameters @ values).tolist()),
+        tuple(sigmas.tolist()),
         gain,
-        float(chdtrc(len(group), gain)),
+        float(chdtrc(freedom, gain)),
     )
 
 
@@ -331,19 +419,16 @@ def _select(estimate: _Estimate) -> list[Change]:
     """The changes that the views prove, the most significant first, each given all of them."""
     chosen: list[str] = []
     while len(chosen) < len(CHANGES):
-        given = [p for name in chosen for p in CHANGES[name]]
-        rest = [_test(estimate, given, name) for name in CHANGES if name not in chosen]
+        rest = [_test(estimate, chosen, name) for name in CHANGES if name not in chosen]
         best = min(rest, key=lambda change: change.p_value)
         if best.p_value >= CHECK_FALSE_ALARMS / _TESTS:
             break
         chosen.append(best.name)
     # What a later choice explains better is taken back.
     while True:
-        others = {
-            name: [p for other in chosen if other != name for p in CHANGES[other]]
-            for name in chosen
-        }
-        found = [_test(estimate, others[name], name) for name in chosen]
+        found = [
+            _test(estimate, [other for other in chosen if other != name], name) for name in chosen
+        ]
         needless = [change for change in found if change.p_value >= CHECK_FALSE_ALARMS / _TESTS]
         if not needless:
             return sorted(found, key=lambda change: change.p_value)
@@ -408,7 +493,7 @@ def _with_effect(model: CalibrationModel, setup: Setup, change: Change) -> Chang
         plane = (np.stack([x.ravel(), y.ravel()], axis=1) - (camera.px, camera.py)) @ inverse.T
         points = np.column_stack([plane, np.zeros(len(plane))])
         changed: dict[str, Any] = {}
-        for name, value in zip(CHANGES[change.name], change.values, strict=True):
+        for name, value in zip(groups_of_changes(model)[change.name], change.values, strict=True):
             if name == "scale":
                 changed["m"] = camera.m * (1.0 + value)
             else:

@@ -34,7 +34,7 @@ from semcal_ros.core.calibration.estimator.blocks import Effects, State, make_pr
 from semcal_ros.core.calibration.estimator.bundle_adjustment import refine
 from semcal_ros.core.calibration.estimator.problem import Priors
 from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA, REFERENCE_WIDTH_PX
-from semcal_ros.core.calibration.judgement.revision import CHANGING, record_of
+from semcal_ros.core.calibration.judgement.revision import record_of
 from semcal_ros.core.calibration.judgement.thresholds import (
     CANDIDATES,
     JUDGED,
@@ -223,8 +223,7 @@ def _aged(model: CalibrationModel, ageing: float) -> Array:
     changes = change_directions(model, model.image_width)
     if ageing == 0.0:
         return changes[:, :0]
-    sigmas = ageing_sigmas(ageing, model.image_width)
-    return changes * [sigmas[name] for name in CHANGING]
+    return changes * list(ageing_sigmas(model, ageing, model.image_width).values())
 
 
 def _design(model: CalibrationModel, g: float) -> Array:

@@ -75,11 +75,23 @@ from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.records import FitRecord
 from semcal_ros.core.errors import CalibrationError
 
-#: Parameters that may have changed since the calibration, by the same amount at all magnifications; that of the
-#: scale is relative.
-CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "ex", "ey")
-#: Those of which a part may have changed in proportion to them, as the distortion of a lens that got stronger does.
-GAINS = ("xi_r", "xi_t")
+_CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "xi_u", "ex", "ey")
+_GAINS = ("xi_r", "xi_t", "xi_u")
+
+
+def changing(model: CalibrationModel) -> tuple[str, ...]:
+    """Return the parameters that may have changed since the calibration, by the same amount at all magnifications.
+
+    That of the scale is relative. A calibration from a specimen, or from an old file, has no ``xi_u``.
+    """
+    return tuple(name for name in _CHANGING if name in model.functions)
+
+
+def gaining(model: CalibrationModel) -> tuple[str, ...]:
+    """Return those of which a part may have changed in proportion to them, as the distortion of a lens that got
+    stronger does.
+    """
+    return tuple(name for name in _GAINS if name in model.functions)
 
 
 @dataclass(frozen=True)
@@ -94,8 +106,8 @@ class Revision:
         The new views, with the residual field of the calibration taken out.
     problem, result
         The adjustment. Its unknowns are a 1, the principal components of the calibration's covariance in sigmas,
-        the height of the grid and the size of its squares, :data:`CHANGING`, the relative changes of :data:`GAINS`,
-        and what all views share.
+        the height of the grid and the size of its squares, the changes of :func:`changing`, the relative changes of
+        :func:`gaining`, and what all views share.
     covariance
         (K, K) of the unknowns, with what the jitter of lines adds.
     misfit
@@ -116,20 +128,22 @@ class Revision:
 
     @property
     def changes(self) -> slice:
-        """Where :data:`CHANGING` are among the unknowns."""
-        first = self.gains.start - len(CHANGING)
-        return slice(first, first + len(CHANGING))
+        """Where the changes of :func:`changing` are among the unknowns."""
+        count = len(changing(self.model))
+        return slice(self.gains.start - count, self.gains.start)
 
     @property
     def gains(self) -> slice:
-        """Where the relative changes of :data:`GAINS` are among the unknowns."""
-        first = len(self.result.state.theta) - len(self.problem.shared) - len(GAINS)
-        return slice(first, first + len(GAINS))
+        """Where the relative changes of :func:`gaining` are among the unknowns."""
+        count = len(gaining(self.model))
+        first = len(self.result.state.theta) - len(self.problem.shared) - count
+        return slice(first, first + count)
 
 
-def free_sigmas(setup: Setup) -> dict[str, float]:
+def free_sigmas(model: CalibrationModel, setup: Setup) -> dict[str, float]:
     """Prior 1-sigma of changes of any size, by name."""
-    return {name: FREE_CHANGE if name == "scale" else setup.prior_of(name)[1] for name in CHANGING}
+    free = {name: setup.prior_of(name)[1] for name in changing(model)}
+    return free | {"scale": FREE_CHANGE}
 
 
 def make_setup(
@@ -261,9 +275,9 @@ def revise(
     setup
         The views, from :func:`make_setup`.
     sigmas
-        Prior 1-sigma of each of :data:`CHANGING`.
+        Prior 1-sigma of each change of :func:`changing`.
     gains
-        That of the relative changes of :data:`GAINS`; None: they change by the same amount everywhere.
+        That of the relative changes of :func:`gaining`; None: they change by the same amount everywhere.
 
     Raises
     ------
@@ -277,8 +291,8 @@ def revise(
     )
     spread = _spread(model, setup)
     every = [
-        *(sigmas[name] for name in CHANGING),
-        *((gains or {}).get(name, 0.0) for name in GAINS),
+        *(sigmas[name] for name in changing(model)),
+        *((gains or {}).get(name, 0.0) for name in gaining(model)),
     ]
     problem = _build(model, setup, spread, every)
     unknowns = problem.designs.shape[2] - len(setup.shared)
@@ -312,15 +326,16 @@ def _build(
     spread: VarianceComponents,
     sigmas: Sequence[float],
 ) -> Problem:
-    """Make the adjustment: the camera as calibrated, then :data:`CHANGING` and :data:`GAINS`, whose prior ``sigmas``
-    are given, then what all views share.
+    """Make the adjustment: the camera as calibrated, then the changes of :func:`changing` and of :func:`gaining`, whose
+    prior ``sigmas`` are given, then what all views share.
     """
     problem = build_problem(setup, model.functions, setup.views, spread)
     designs, sigma = _camera_designs(model, setup)
     changes = np.zeros((*designs.shape[:2], len(sigmas)))
-    for column, name in enumerate((*CHANGING, *GAINS)):
+    by_amount = changing(model)
+    for column, name in enumerate((*by_amount, *gaining(model))):
         row = ALL_FUNCTIONS.index(name)
-        is_relative = name == "scale" or column >= len(CHANGING)
+        is_relative = name == "scale" or column >= len(by_amount)
         changes[:, row, column] = designs[:, row, 0] if is_relative else 1.0
     free = np.maximum(sigmas, HELD_SIGMA)
     cameras = np.concatenate([designs, changes], axis=2)

@@ -30,25 +30,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semcal_ros.core.arrays import Array
-from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.judgement.check import (
-    CHANGES,
     CalibrationCheck,
     Verdict,
     check_calibration,
+    gain_sigmas,
+    groups_of_changes,
 )
 from semcal_ros.core.calibration.judgement.revision import (
-    CHANGING,
-    GAINS,
     Revision,
+    changing,
     free_sigmas,
+    gaining,
     make_setup,
     revise,
 )
 from semcal_ros.core.calibration.judgement.thresholds import (
     AGEING_MAX,
     DEFAULT_AGEING,
-    GAIN_MAX,
     SHAPE_PART,
     UPDATE_MISFIT,
 )
@@ -132,11 +131,11 @@ def update_calibration(
             do="calibrate anew",
         )
     setup = make_setup(model, views, image_size, untilted, axis or StageAxis())
-    free = free_sigmas(setup)
-    proven = {name for change in check.changes for name in CHANGES[change.name]}
-    aged = ageing_sigmas(ageing, image_size[0])
-    sigmas = {name: free[name] if name in proven else aged[name] for name in CHANGING}
-    revision = revise(model, setup, sigmas, _gain_sigmas(model, setup, check))
+    free, groups = free_sigmas(model, setup), groups_of_changes(model)
+    proven = {name for change in check.changes for name in groups[change.name]}
+    aged = ageing_sigmas(model, ageing, image_size[0])
+    sigmas = {name: free[name] if name in proven else aged[name] for name in free}
+    revision = revise(model, setup, sigmas, gain_sigmas(model, setup, check.changes))
     rms_px = float(np.sqrt(np.mean(np.sum(revision.result.residuals_px**2, axis=1))))
     renewed = _apply(revision)
     log = model.statistics.get("updates", [])
@@ -171,20 +170,23 @@ def _warnings_after(before: object, misfit: float) -> list[str]:
     return kept
 
 
-def ageing_sigmas(ageing: float, image_width: int) -> dict[str, float]:
-    """Return the prior 1-sigma of each of :data:`~semcal_ros.core.calibration.judgement.revision.CHANGING`.
+def ageing_sigmas(model: CalibrationModel, ageing: float, image_width: int) -> dict[str, float]:
+    """Return the prior 1-sigma of each change of :func:`~semcal_ros.core.calibration.judgement.revision.changing`.
 
     Parameters
     ----------
+    model
+        The calibration.
     ageing
         That of the scale, relative.
     image_width
         Of the images in whose pixels a centre moves.
     """
-    # The scale displaces the edge by ageing x half a width; so do xi_r and xi_t there, at a distance of 1. The
+    # The scale displaces the edge by ageing x half a width; so do xi_r, xi_t and xi_u there, at a distance of 1. The
     # centre of the distortion moves by that displacement itself.
     part = SHAPE_PART * ageing
-    sigmas = dict.fromkeys(CHANGING, part) | dict.fromkeys(("ex", "ey"), part * 0.5 * image_width)
+    sigmas = dict.fromkeys(changing(model), part)
+    sigmas |= dict.fromkeys(("ex", "ey"), part * 0.5 * image_width)
     return sigmas | {"scale": ageing}
 
 
@@ -201,33 +203,15 @@ def change_directions(model: CalibrationModel, image_width: int) -> Array:
     columns = columns_of(model.functions)
     # Images of another size have their centre at another pixel, in other units.
     per_px = model.image_width / image_width
-    changes = np.zeros((len(model.coefficients), len(CHANGING)))
-    for column, name in enumerate(CHANGING):
+    names = changing(model)
+    changes = np.zeros((len(model.coefficients), len(names)))
+    for column, name in enumerate(names):
         own, function = columns[name], model.functions[name]
         if name == "scale":
             changes[own, column] = function.coefficients
         else:
             changes[own, column] = _constant(function) * (per_px if name in ("ex", "ey") else 1.0)
     return changes
-
-
-def _gain_sigmas(
-    model: CalibrationModel, setup: Setup, check: CalibrationCheck
-) -> dict[str, float]:
-    """Return the prior 1-sigma of the relative changes of :data:`GAINS`: so large that they could be the whole change
-    that was proven, where the views are.
-
-    Whether the distortion has changed by the same amount at all magnifications or in proportion, views at one of them
-    do not tell.
-    """
-    sigmas = {}
-    for change in check.changes:
-        for name, value in zip(CHANGES[change.name], change.values, strict=True):
-            if name in GAINS:
-                own = [model.functions[name](float(g)) for g in setup.magnifications]
-                usual = float(np.sqrt(np.mean(np.square(own))))
-                sigmas[name] = min(abs(value) / max(usual, np.finfo(np.float64).tiny), GAIN_MAX)
-    return sigmas
 
 
 def _constant(function: ContinuousFunction) -> Array:
@@ -247,8 +231,9 @@ def _apply(revision: Revision) -> CalibrationModel:
     root = model.principal_components
     changes = change_directions(model, revision.setup.image_size[0])
     columns = columns_of(model.functions)
-    gains = np.zeros((len(root), len(GAINS)))
-    for column, name in enumerate(GAINS):
+    names = gaining(model)
+    gains = np.zeros((len(root), len(names)))
+    for column, name in enumerate(names):
         gains[columns[name], column] = model.functions[name].coefficients
     steps, size = np.concatenate([root, changes, gains], axis=1), len(root)
     index = np.r_[revision.components, revision.changes, revision.gains]
