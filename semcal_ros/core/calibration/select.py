@@ -61,7 +61,10 @@ from semcal_ros.core.calibration.estimator.residual_field_fit import (
     solve_field,
     undo_field,
 )
-from semcal_ros.core.calibration.estimator.variance_components import update_components
+from semcal_ros.core.calibration.estimator.variance_components import (
+    limit_lattices,
+    update_components,
+)
 from semcal_ros.core.calibration.start import Start, tempered
 from semcal_ros.core.calibration.thresholds import (
     BELIEF_STEP_MIN,
@@ -422,6 +425,7 @@ def select_and_adjust(
     """
     always = smooth_names(functions) if always is None else always
     always = (*always, *(name for name in LATE_TERMS if name in functions))
+    spread = limit_lattices(setup, spread)
     problem = build_problem(setup, functions, setup.views, spread)
     state = replace(state, theta=stack_theta(setup, functions, state))
     result, _ = adjust_with_other_poses(setup, functions, spread, problem, state)
@@ -442,7 +446,7 @@ def select_and_adjust(
             continue
         sizes = chosen
         functions = refit_functions(with_coefficients(functions, result.state.theta), chosen)
-        spread = update_components(setup, problem, result)
+        spread = limit_lattices(setup, update_components(setup, problem, result))
         problem = build_problem(setup, functions, setup.views, spread)
         state = replace(result.state, theta=stack_theta(setup, functions, result.state))
         result = refine_coarsely(problem, state)

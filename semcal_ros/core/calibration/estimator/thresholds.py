@@ -201,6 +201,11 @@ USUAL_LATTICES = TABLE.defined(
     "USUAL_LATTICES", 1.0, "effects",
     "Of a stretch or shear of lattices for which the usual spread counts against a larger one: one lattice.",
 )
+CHOICE_LATTICES_MAX = TABLE.stated(
+    "CHOICE_LATTICES_MAX", 8.0, "of the usual spread",
+    "Of the lattices while coefficients are chosen: more than that of a bad grid, 0.1 %, and less than what takes the "
+    "place of a missing term, 1 %.",
+)
 SPREAD_MIN = TABLE.measured(
     "SPREAD_MIN", 0.01, "of the usual spread",
     "Below it, no view shows a spread. 1.5 times as large or as small, 9 cases are decided alike, and errors change "

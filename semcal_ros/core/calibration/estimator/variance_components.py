@@ -42,6 +42,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     usual_lattice_sigmas,
 )
 from semcal_ros.core.calibration.estimator.thresholds import (
+    CHOICE_LATTICES_MAX,
     FLAT_RAD,
     SPREAD_COUNT_MIN,
     SPREAD_MAX,
@@ -109,6 +110,18 @@ def limit_components(setup: Setup, found: VarianceComponents) -> VarianceCompone
         drift_sigma_px=np.minimum(found.drift_sigma_px, usual.drift_sigma_px),
         lattice_sigma=lattice,
     )
+
+
+def limit_lattices(setup: Setup, found: VarianceComponents) -> VarianceComponents:
+    """Return spreads of which that of the lattices is at most :data:`CHOICE_LATTICES_MAX` usual ones.
+
+    For the choice of coefficients: under a wider one, what the model does not have yet passes for stretched lattices,
+    for which tilts make room, and is never missed.
+    """
+    if found.lattice_sigma is None:
+        return found
+    largest = CHOICE_LATTICES_MAX * usual_lattice_sigmas(setup.priors)
+    return replace(found, lattice_sigma=np.minimum(found.lattice_sigma, largest))
 
 
 def accelerate_components(
