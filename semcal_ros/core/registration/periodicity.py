@@ -27,6 +27,7 @@ from semcal_ros.core.registration.thresholds import (
     COARSE_PERIOD_MIN,
     DIP_MAX,
     PERIOD_PX_MIN,
+    PERIOD_SIGMAS,
     PERIODS_SIDE_PX_MAX,
     PERIODS_SINE_MIN,
     REPEATED_MIN,
@@ -60,7 +61,8 @@ def find_periods(image: Image, noise_variance: float) -> Array:
     # Lags of one half plane; the other one is its mirror image.
     lags = np.concatenate([whole[: high + 1, -wide:], whole[: high + 1, : wide + 1]], axis=1)
     y, x = np.arange(high + 1)[:, None], np.arange(-wide, wide + 1)[None, :]
-    surface = lags / ((rows - y) * (cols - np.abs(x)))
+    pairs = (rows - y) * (cols - np.abs(x))
+    surface = lags / pairs
     structure = float(surface[0, wide]) - left * noise_variance
     if structure <= 0.0:
         return np.zeros((0, 2))
@@ -68,7 +70,9 @@ def find_periods(image: Image, noise_variance: float) -> Array:
     near, far = (float(surface[n, wide] + surface[0, wide + n]) / 2.0 for n in (1, 2))
     structure = float(np.clip((4.0 * near - far) / 3.0, 0.5 * structure, structure))
     surface = surface / structure
-    peaks = _find_repeats(surface, wide)
+    # Where there is little structure, white noise alone makes such peaks.
+    chance = PERIOD_SIGMAS * surface[0, wide] / np.sqrt(pairs)
+    peaks = _find_repeats(surface, chance, wide)
     if not peaks:
         return np.zeros((0, 2))
     first = peaks[0]
@@ -96,10 +100,15 @@ def _soften(image: Image) -> tuple[Image, float]:
     return np.asarray(image * factors), float(np.mean(factors**2))
 
 
-def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
-    """Lags at which the structure repeats, the shortest first."""
+def _find_repeats(surface: Array, chance: Array, wide: int) -> list[tuple[float, float]]:
+    """Lags at which the structure repeats, the shortest first.
+
+    They are peaks beyond ``chance``, also over what is on the way to them.
+    """
+    least = np.maximum(REPEATED_MIN, chance)
+    highest_dip = np.minimum(DIP_MAX * surface, surface - chance)
     inner = surface[1:-1, 1:-1]
-    is_peak = inner >= REPEATED_MIN
+    is_peak = inner >= least[1:-1, 1:-1]
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             if dy or dx:
@@ -113,7 +122,7 @@ def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
             continue
         steps = np.linspace(0.0, 1.0, int(2 * length) + 1)[1:-1]
         way = surface[np.rint(steps * y).astype(int), np.rint(steps * x).astype(int) + wide]
-        if float(way.min()) > DIP_MAX * surface[row + 1, col + 1]:
+        if float(way.min()) > highest_dip[row + 1, col + 1]:
             continue
         found.append(
             (
@@ -126,13 +135,11 @@ def _find_repeats(surface: Array, wide: int) -> list[tuple[float, float]]:
     mirrored = surface[0]
     for col in range(wide + int(PERIOD_PX_MIN), len(mirrored) - 1):
         x = float(col - wide)
-        if mirrored[col] < REPEATED_MIN or mirrored[col] < max(
-            mirrored[col - 1], mirrored[col + 1]
-        ):
+        if mirrored[col] < max(least[0, col], mirrored[col - 1], mirrored[col + 1]):
             continue
         if mirrored[col] < max(surface[1, col - 1 : col + 2]):
             continue
-        if float(mirrored[wide + 1 : col].min()) <= DIP_MAX * mirrored[col]:
+        if float(mirrored[wide + 1 : col].min()) <= highest_dip[0, col]:
             found.append((x, x + parabola_vertex(*mirrored[col - 1 : col + 2]), 0.0))
     return [(x, y) for _, x, y in sorted(found)]
 

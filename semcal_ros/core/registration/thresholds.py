@@ -388,6 +388,11 @@ REPEATED_MIN = TABLE.measured(
     "That repeats. With 0.733, nothing changes; with 0.4, 1 of 8 cases is decided otherwise.",
     command=TRIED,
 )
+PERIOD_SIGMAS = TABLE.derived(
+    "PERIOD_SIGMAS", 5.5, "sigma",
+    "Of white noise in the autocorrelation, which a period exceeds: by chance in one image of 1000, of 130 000 lags "
+    "(normal, one side: 5.66) or 51 000 (5.50, of 320 px).",
+)
 DIP_MAX = TABLE.stated(
     "DIP_MAX", 0.7, "of what repeats",
     "To which the autocorrelation falls on the way to a period.",
