@@ -128,7 +128,8 @@ class Registration:
     moving
         What does not move with the specimen and was left out; None where all does.
     share
-        Part of the structure that agrees with the shift.
+        Part of the structure that agrees with the shift; where something moved otherwise in the image before, that is
+        left out, if it is not most.
     along
         (2,) the direction of lines along which the shift is the predicted one, since they do not tell it, and its
         covariance means nothing; None where both directions are measured.

@@ -69,6 +69,21 @@ class _Hypothesis:
     start: CoarsePeak
     suspected: Mask | None
 
+    @property
+    def share(self) -> float:
+        """Part of the structure that agrees, where most of it did not move otherwise in the image before: of that.
+
+        A tool that was known before stays where it is when the stage moves.
+        """
+        if self.suspected is None:
+            return self.agreement.share
+        others = ~grow_mask(self.suspected, 1)
+        informs = self.agreement.informs
+        total = float(informs[others].sum())
+        if total <= MAJORITY_SHARE * float(informs.sum()):
+            return self.agreement.share
+        return float(informs[others & ~self.agreement.disagrees].sum()) / total
+
 
 def look_at_whole(
     reference: Reference,
@@ -103,7 +118,7 @@ class Kept:
     peak
         Where it was looked for.
     moving, share
-        What moves otherwise, and the part of the structure that agrees.
+        What moves otherwise, and the part of the structure that agrees, as of :class:`_Hypothesis`.
     other_px
         (2,) another shift with which a part of the image agrees, which may be the one; NaN where there is none.
     """
@@ -212,7 +227,7 @@ def keep_specimen(
     if isinstance(best, Rejection):
         return Kept(best, peak, None, 0.0, other_px)
     moving = find_moving(reference, best.alignment, best.agreement)
-    share = best.agreement.share
+    share = best.share
     if follow_px is not None:
         share = _share_inside(best.alignment, best.agreement, reference, follow_px)
     return Kept(best.alignment, best.start, moving, share, other_px)

@@ -686,3 +686,27 @@ def test_a_frame_whose_parts_fit_elsewhere_coasts_with_a_sigma_that_says_so(seed
         update = tracker.update(frame, float(k))
     assert "strained" in update.reason
     assert np.all(np.abs(update.drift_px - drift[15]) < 3.0 * update.sigma_px)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_stage_may_move_under_a_tool_that_was_seen_before(seed: int) -> None:
+    """The tool stays where it is. What else moves by 11 px, nine tenths of the structure, was refused until it was
+    given up, since it was not all.
+    """
+    texture, tracker = Texture(seed), DriftTracker()
+    updates, drift = [], []
+    for k in range(16):
+        moved = (-0.3 * k - 2.0 * (k >= 10), 0.4 * k - 11.0 * (k >= 10))
+        scene = 128.0 + 40.0 * texture.view(moved, 256)
+        scene[120:140, :150] = 200.0
+        picture = ndimage.gaussian_filter(scene, 1.0)
+        picture += np.random.default_rng(100 * seed + k).normal(0.0, 15.0, scene.shape)
+        updates.append(tracker.update(picture, float(k)))
+        drift.append(moved)
+    assert all(u.accepted for u in updates[:10])
+    # The second frame after it says that the first one was right.
+    assert all(u.accepted for u in updates[11:])
+    for update, moved in zip(updates, drift, strict=True):
+        if update.accepted and update.covariance[0, 0] > 0.0:
+            error = update.drift_px - np.array(moved)
+            assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(update.covariance)[:2]) + 0.02)
