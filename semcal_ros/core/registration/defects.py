@@ -29,6 +29,7 @@ explain, which was not among the compared ones: more defects have to speak for a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -44,6 +45,7 @@ from semcal_ros.core.registration.agreement import (
     information_weights,
 )
 from semcal_ros.core.registration.failures import MatchFailure
+from semcal_ros.core.registration.fixed_pixels import grow_mask
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
     TileStatistics,
@@ -66,6 +68,7 @@ from semcal_ros.core.registration.thresholds import (
     PERIODS_COMPARED_MAX,
     PERIODS_REACH_SIGMAS,
     SAME_SHIFT_PX,
+    SMEARED_PX,
 )
 from semcal_ros.core.registration.tiles import Pyramid, PyramidLevel
 
@@ -114,14 +117,14 @@ class _Shown:
     hidden: Array
 
     @classmethod
-    def of(cls, level: PyramidLevel, reference: Mask, image: Mask) -> _Shown:
-        """From the pixels (h, w) of both that do."""
+    def of(cls, level: PyramidLevel, reference: Mask, image: Mask, fixed: Mask | None) -> _Shown:
+        """From the pixels (h, w) of both that do, and those of the image that are ``fixed``."""
         # The edge of something else may run through the tiles around.
         around = np.ones((2 * level.side[1] + 1, 2 * level.side[0] + 1), np.uint8)
-        hidden = [
-            np.asarray(cv2.integral(cv2.dilate((~mask).astype(np.uint8), around)), np.float64)
-            for mask in (reference, image)
-        ]
+        masks = [cv2.dilate((~mask).astype(np.uint8), around) for mask in (reference, image)]
+        if fixed is not None:
+            masks[1][grow_mask(fixed, SMEARED_PX + math.ceil(level.sigma_px))] = 1
+        hidden = [np.asarray(cv2.integral(mask), np.float64) for mask in masks]
         return cls(level, _is_free(level, hidden[0], np.zeros(2)), hidden[1])
 
     @property
@@ -192,6 +195,7 @@ def choose_period(
     spread: Array | None,
     noise: TileNoise,
     repeats: tuple[Mask, Mask],
+    fixed: Mask | None = None,
 ) -> ChosenShift | UntoldShift:
     """The shift of a periodic specimen that its defects tell, or why it is not told.
 
@@ -213,9 +217,12 @@ def choose_period(
     repeats
         (h, w) where each of them shows the lattice
         (:func:`~semcal_ros.core.registration.periodicity.find_repeating`).
+    fixed
+        (h, w) True at the pixels of the image that do not show the specimen, or None. The reference is without them at
+        the predicted shift alone: at another period they would be defects.
     """
     level = levels[-1]
-    shown = _Shown.of(level, *repeats)
+    shown = _Shown.of(level, *repeats, fixed)
     first = _refine_first(pyramid, start_px, noise, shown)
     if isinstance(first, Rejection):
         return UntoldShift(first, np.full(2, np.nan))
@@ -237,6 +244,9 @@ def choose_period(
             best = other
     predicted = _find_predicted(compared, periods, guess, spread)
     usual = None if is_fine(periods, level.size) else predicted
+    if usual is not best and spread is not None and usual is not None:
+        # A stage may have moved by nearly a period.
+        usual = usual if _is_expected(usual, guess, spread) else None
     if usual is not None and (usual is best or not _tells(best, usual, EVIDENCE_MIN)):
         best, rejection = usual, _find_flaw(usual, periods, noise)
     else:
@@ -440,6 +450,12 @@ def _find_predicted(
     distances = [np.inf if c.is_held else float(np.hypot(*(c.shift_px - guess))) for c in compared]
     nearest = int(np.argmin(distances))
     return compared[nearest] if distances[nearest] < 0.25 * shortest else None
+
+
+def _is_expected(candidate: _Candidate, guess: Array, spread: Array) -> bool:
+    """Whether a shift is where it was predicted."""
+    left = candidate.shift_px - guess
+    return float(left @ np.linalg.solve(spread, left)) <= PERIODS_REACH_SIGMAS**2
 
 
 def _list_shifts(

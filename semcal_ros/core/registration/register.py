@@ -425,6 +425,7 @@ def register(
             max_shear_px=max_shear_px,
             max_stretch=max_stretch,
             suspected=suspected,
+            fixed=fixed,
         )
         away_px = np.abs(found.shift_px - dropped_at)
         if part is reference or not np.any(away_px > DROPPED_WITHIN_PX):
@@ -531,6 +532,7 @@ def _register(
     max_shear_px: float,
     max_stretch: float,
     suspected: MovingTiles | None,
+    fixed: Mask | None,
     by_defects: bool = False,
 ) -> Registration:
     """Measure a shift in both directions; of what repeats, by its defects where several shifts stand out, or where
@@ -583,6 +585,7 @@ def _register(
             spread,
             noise_beside_tools(reference, pyramid),
             (reference.repeats, reference.find_repeating(pyramid.centred(1))),
+            None if fixed is None else fixed[inside[1] : inside[3], inside[0] : inside[2]],
         )
         if isinstance(told, ChosenShift):
             chosen = _peak_at(start, told.alignment), told.alignment
@@ -626,6 +629,7 @@ def _register(
             max_shear_px=max_shear_px,
             max_stretch=max_stretch,
             suspected=suspected,
+            fixed=fixed,
             by_defects=True,
         )
     if is_part:
