@@ -112,14 +112,19 @@ def leave_place(
     """
     if all(one.rejection.status in IMAGE_FAILURES for one in rejected):
         return state
-    _, covariance = state.filter.state.predict_shift(key)
-    variance_px2 = np.linalg.eigvalsh(frame.px_from_unit @ covariance @ frame.px_from_unit.T)[-1]
-    if variance_px2 <= reach_of_drift_px(setup.settings.first_step_px) ** 2:
+    if not is_lost(setup, state, frame, key):
         return state
     since_s = max(state.filter.state.time_s - state.previous_s, INTERVAL_S_MIN)
     speed_px_s = setup.settings.first_step_px / since_s
     out_of_sight_px = float(max(frame.size))
     return state.inflate(inflate_when_lost(frame.px_from_unit, out_of_sight_px, speed_px_s))
+
+
+def is_lost(setup: TrackerSetup, state: TrackerState, frame: ScanFrame, key: int) -> bool:
+    """Whether it is not known, to as far as drift gets between two frames, how far a keyframe is from a frame."""
+    _, covariance = state.filter.state.predict_shift(key)
+    variance_px2 = np.linalg.eigvalsh(frame.px_from_unit @ covariance @ frame.px_from_unit.T)[-1]
+    return bool(variance_px2 > reach_of_drift_px(setup.settings.first_step_px) ** 2)
 
 
 def _reach_px(setup: TrackerSetup, frame: ScanFrame) -> float:

@@ -89,6 +89,8 @@ class TrackerState:
         The test of shifts that were not expected.
     rejected
         Number of frames in a row that did not match.
+    sought
+        Number of frames that matched since it is not known how far an earlier keyframe is.
     doubt
         (2, 2) what the last frames that contradict the prediction add to the covariance of the drift, until one
         matches.
@@ -117,6 +119,7 @@ class TrackerState:
     late_s: float = 0.0
     outliers: OutlierTest = field(default_factory=OutlierTest)
     rejected: int = 0
+    sought: int = 0
     doubt: Array = field(default_factory=lambda: np.zeros((2, 2)))
     jump: Array = field(default_factory=lambda: np.zeros((2, 2)))
     moving: MovingTiles | None = None

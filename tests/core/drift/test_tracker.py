@@ -28,14 +28,17 @@ from scipy import ndimage, spatial, special
 from benchmarks.drift.scenes import KINDS, draw
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_timing import ScanTiming
+from semcal_ros.core.drift import tracker
 from semcal_ros.core.drift.estimates import DriftUpdate
-from semcal_ros.core.drift.frame import MotionCorrector
+from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame
 from semcal_ros.core.drift.history import DriftHistory
+from semcal_ros.core.drift.keyframe_store import Candidate
+from semcal_ros.core.drift.matching import Match, RejectedMatch
 from semcal_ros.core.drift.remade_keyframes import correct_shear
 from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.tracker import DriftTracker
-from semcal_ros.core.drift.tracker_state import TrackerSetup
-from semcal_ros.core.errors import InvalidValueError
+from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState
+from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from tests.helpers.drift_scenes import DriftingSpecimen, Texture, lattice, noisy, small_camera
 
@@ -747,3 +750,33 @@ def test_a_stage_that_moves_by_nearly_a_period_under_a_cross_hair_is_not_followe
         found += update.accepted and bool(update.sigma_px.max() < 0.1)
     # With few defects beside the cross-hair, two of three: seven of ten series were.
     assert found >= 2
+
+
+def test_a_place_that_was_lost_is_found_again_where_it_is_still_in_sight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Eight frames are refused, for any reason; the frames after it show what was seen before, and tell where it is.
+    The sigma stayed at half of the image.
+    """
+    refuses, match = set(range(6, 14)), tracker.match_keyframe
+
+    def match_seldom(
+        setup: TrackerSetup, state: TrackerState, frame: ScanFrame, candidate: Candidate
+    ) -> tuple[TrackerState, Match | RejectedMatch]:
+        state, found = match(setup, state, frame, candidate)
+        if round(state.filter.state.time_s) in refuses:
+            return state, RejectedMatch(
+                Rejection(MatchFailure.AMBIGUOUS, "ambiguous"), found.registration
+            )
+        return state, found
+
+    monkeypatch.setattr(tracker, "match_keyframe", match_seldom)
+    texture, own = Texture(3), DriftTracker()
+    for k in range(20):
+        # It turns round while nothing is seen.
+        moved = np.array([0.8 * k if k < 6 else 4.8 - 0.6 * (k - 6), 0.3 * k])
+        picture = noisy(texture.view((float(moved[0]), float(moved[1])), 192), 8.0, k)
+        update = own.update(picture, float(k))
+        assert update.accepted == (k not in refuses)
+    assert update.sigma_px.max() < 0.1
+    assert np.all(np.abs(update.drift_px - moved) < 4.0 * update.sigma_px)
