@@ -12,7 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Frames that do not match: the drift goes on as predicted, the specimen is lost, and tracking starts again."""
+"""Frames that do not match: the drift goes on as predicted, the specimen is lost, tracking starts again, and the place
+is found again.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +24,7 @@ import numpy as np
 
 from semcal_ros.core.arrays import Array
 from semcal_ros.core.drift.estimates import DriftStatus, DriftUpdate
+from semcal_ros.core.drift.filter_update import use_match
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.gating import (
     OutlierTest,
@@ -30,12 +33,11 @@ from semcal_ros.core.drift.gating import (
     inflate_when_lost,
     reach_of_drift_px,
 )
-from semcal_ros.core.drift.matching import RejectedMatch
+from semcal_ros.core.drift.keyframe_store import Candidate
+from semcal_ros.core.drift.matching import Match, RejectedMatch, match_keyframe
 from semcal_ros.core.drift.measurement import is_removable
 from semcal_ros.core.drift.new_keyframes import add_keyframe, prepare_keyframe
-from semcal_ros.core.drift.thresholds import (
-    INTERVAL_S_MIN,
-)
+from semcal_ros.core.drift.thresholds import INTERVAL_S_MIN, WHOLE_SHARE_MIN
 from semcal_ros.core.drift.tracker_state import TrackerSetup, TrackerState, make_update
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import IMAGE_FAILURES, SEEN_AWAY, MatchFailure
@@ -112,7 +114,7 @@ def leave_place(
     """
     if all(one.rejection.status in IMAGE_FAILURES for one in rejected):
         return state
-    if not is_lost(setup, state, frame, key):
+    if not _is_lost(setup, state, frame, key):
         return state
     since_s = max(state.filter.state.time_s - state.previous_s, INTERVAL_S_MIN)
     speed_px_s = setup.settings.first_step_px / since_s
@@ -120,7 +122,53 @@ def leave_place(
     return state.inflate(inflate_when_lost(frame.px_from_unit, out_of_sight_px, speed_px_s))
 
 
-def is_lost(setup: TrackerSetup, state: TrackerState, frame: ScanFrame, key: int) -> bool:
+def find_place_again(
+    setup: TrackerSetup,
+    state: TrackerState,
+    frame: ScanFrame,
+    match: Match,
+    candidates: list[Candidate],
+) -> TrackerState:
+    """Measure a frame that was matched against a keyframe from before the place was lost, too: that tells how far what
+    came after it is from what came before.
+
+    It is tried in the first, second, fourth, eighth frame, and so on. All of the structure has to agree, most of it to
+    be in sight still, and it has to be no farther than drift gets until a place is given up: nothing says where a part
+    of it would be, and a coarse grid repeats beyond that.
+    """
+    in_px = frame.px_from_unit @ state.filter.state.covariance[:2, :2] @ frame.px_from_unit.T
+    if np.trace(in_px) <= reach_of_drift_px(setup.settings.first_step_px) ** 2:
+        return replace(state, sought=0) if state.sought else state
+    state = replace(state, sought=state.sought + 1)
+    if state.sought & (state.sought - 1):
+        return state
+    apart = [
+        c
+        for c in candidates
+        if c.key != match.candidate.key and not c.rescaled and _is_lost(setup, state, frame, c.key)
+    ]
+    if not apart:
+        return state
+    known, again = match_keyframe(setup, state, frame, apart[0])
+    if isinstance(again, RejectedMatch) or again.registration.along is not None:
+        return state
+    alignment = again.registration.alignment
+    expected, _ = state.filter.state.predict_shift(apart[0].key)
+    away_px = float(np.linalg.norm(frame.px_from_unit @ (again.measure.shift[:2] - expected)))
+    is_in_sight = (
+        alignment.overlap >= setup.settings.rekey_overlap
+        and away_px <= setup.settings.lost_after * setup.settings.first_step_px
+    )
+    if again.registration.share < WHOLE_SHARE_MIN or not is_in_sight:
+        return state
+    found, refused = use_match(setup, known, frame, again)
+    if refused is not None:
+        return state
+    # What moves by itself was seen with the other one.
+    return replace(found, moving=state.moving, body=state.body, flicker=state.flicker)
+
+
+def _is_lost(setup: TrackerSetup, state: TrackerState, frame: ScanFrame, key: int) -> bool:
     """Whether it is not known, to as far as drift gets between two frames, how far a keyframe is from a frame."""
     _, covariance = state.filter.state.predict_shift(key)
     variance_px2 = np.linalg.eigvalsh(frame.px_from_unit @ covariance @ frame.px_from_unit.T)[-1]

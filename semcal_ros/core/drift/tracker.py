@@ -41,17 +41,13 @@ from semcal_ros.core.drift.estimates import DriftPredictor, DriftStatus, DriftUp
 from semcal_ros.core.drift.filter import DriftFilter
 from semcal_ros.core.drift.filter_update import use_match
 from semcal_ros.core.drift.frame import MotionCorrector, ScanFrame, resampleable
-from semcal_ros.core.drift.gating import (
-    inflate_after_pause,
-    inflate_position,
-    reach_of_drift_px,
-)
+from semcal_ros.core.drift.gating import inflate_after_pause, inflate_position
 from semcal_ros.core.drift.history import DriftHistory
-from semcal_ros.core.drift.keyframe_store import Candidate, KeyframeStore
+from semcal_ros.core.drift.keyframe_store import KeyframeStore
 from semcal_ros.core.drift.matching import Match, RejectedMatch, free_of_pull, match_keyframe
 from semcal_ros.core.drift.new_keyframes import add_keyframe, renew_keyframe
 from semcal_ros.core.drift.operations import Predict
-from semcal_ros.core.drift.recovery import coast, is_lost, leave_place, restart
+from semcal_ros.core.drift.recovery import coast, find_place_again, leave_place, restart
 from semcal_ros.core.drift.remade_keyframes import clean_keyframes
 from semcal_ros.core.drift.settings import DriftSettings
 from semcal_ros.core.drift.similarity import SimilarityState
@@ -68,7 +64,6 @@ from semcal_ros.core.drift.thresholds import (
     STRIPE_MOVE_PX_MAX,
     STRIPE_TRIES,
     VELOCITY_CHANGE,
-    WHOLE_SHARE_MIN,
     ZOOM_MIN,
 )
 from semcal_ros.core.drift.torn_frames import TearTest
@@ -230,57 +225,11 @@ def _follow(
             state = leave_place(setup, state, frame, match.measure.key, rejected)
             state, refused = use_match(setup, state, frame, match)
             if refused is None:
-                state = _find_place_again(setup, state, frame, match, candidates)
+                state = find_place_again(setup, state, frame, match, candidates)
                 return renew_keyframe(setup, state, frame, match)
             match = refused
         rejected.append(match)
     return coast(setup, state, frame, rejected, rescaled=candidates[0].rescaled)
-
-
-def _find_place_again(
-    setup: TrackerSetup,
-    state: TrackerState,
-    frame: ScanFrame,
-    match: Match,
-    candidates: list[Candidate],
-) -> TrackerState:
-    """Measure a frame that was matched against a keyframe from before the place was lost, too: that tells how far what
-    came after it is from what came before.
-
-    It is tried in the first, second, fourth, eighth frame, and so on. All of the structure has to agree, most of it to
-    be in sight still, and it has to be no farther than drift gets until a place is given up: nothing says where a part
-    of it would be, and a coarse grid repeats beyond that.
-    """
-    in_px = frame.px_from_unit @ state.filter.state.covariance[:2, :2] @ frame.px_from_unit.T
-    if np.trace(in_px) <= reach_of_drift_px(setup.settings.first_step_px) ** 2:
-        return replace(state, sought=0) if state.sought else state
-    state = replace(state, sought=state.sought + 1)
-    if state.sought & (state.sought - 1):
-        return state
-    apart = [
-        c
-        for c in candidates
-        if c.key != match.candidate.key and not c.rescaled and is_lost(setup, state, frame, c.key)
-    ]
-    if not apart:
-        return state
-    known, again = match_keyframe(setup, state, frame, apart[0])
-    if isinstance(again, RejectedMatch) or again.registration.along is not None:
-        return state
-    alignment = again.registration.alignment
-    expected, _ = state.filter.state.predict_shift(apart[0].key)
-    away_px = float(np.linalg.norm(frame.px_from_unit @ (again.measure.shift[:2] - expected)))
-    is_in_sight = (
-        alignment.overlap >= setup.settings.rekey_overlap
-        and away_px <= setup.settings.lost_after * setup.settings.first_step_px
-    )
-    if again.registration.share < WHOLE_SHARE_MIN or not is_in_sight:
-        return state
-    found, refused = use_match(setup, known, frame, again)
-    if refused is not None:
-        return state
-    # What moves by itself was seen with the other one.
-    return replace(found, moving=state.moving, body=state.body, flicker=state.flicker)
 
 
 def _find_flaw(state: TrackerState, *, is_repeated: bool) -> Rejection[MatchFailure] | None:
