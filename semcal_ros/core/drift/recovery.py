@@ -34,7 +34,7 @@ from semcal_ros.core.drift.gating import (
     reach_of_drift_px,
 )
 from semcal_ros.core.drift.keyframe_store import Candidate
-from semcal_ros.core.drift.matching import Match, RejectedMatch, match_keyframe
+from semcal_ros.core.drift.matching import RejectedMatch, match_keyframe
 from semcal_ros.core.drift.measurement import is_removable
 from semcal_ros.core.drift.new_keyframes import add_keyframe, prepare_keyframe
 from semcal_ros.core.drift.thresholds import INTERVAL_S_MIN, WHOLE_SHARE_MIN
@@ -126,11 +126,11 @@ def find_place_again(
     setup: TrackerSetup,
     state: TrackerState,
     frame: ScanFrame,
-    match: Match,
+    key: int,
     candidates: list[Candidate],
 ) -> TrackerState:
-    """Measure a frame that was matched against a keyframe from before the place was lost, too: that tells how far what
-    came after it is from what came before.
+    """Measure a frame that matched keyframe ``key`` against one from before the place was lost, too: that tells how far
+    what came after it is from what came before.
 
     It is tried in the first, second, fourth, eighth frame, and so on. All of the structure has to agree, most of it to
     be in sight still, and it has to be no farther than drift gets until a place is given up: nothing says where a part
@@ -145,7 +145,7 @@ def find_place_again(
     apart = [
         c
         for c in candidates
-        if c.key != match.candidate.key and not c.rescaled and _is_lost(setup, state, frame, c.key)
+        if c.key != key and not c.rescaled and _is_lost(setup, state, frame, c.key)
     ]
     if not apart:
         return state

@@ -225,7 +225,7 @@ def _follow(
             state = leave_place(setup, state, frame, match.measure.key, rejected)
             state, refused = use_match(setup, state, frame, match)
             if refused is None:
-                state = find_place_again(setup, state, frame, match, candidates)
+                state = find_place_again(setup, state, frame, match.measure.key, candidates)
                 return renew_keyframe(setup, state, frame, match)
             match = refused
         rejected.append(match)

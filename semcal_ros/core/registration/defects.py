@@ -195,7 +195,7 @@ def choose_period(
     spread: Array | None,
     noise: TileNoise,
     repeats: tuple[Mask, Mask],
-    fixed: Mask | None = None,
+    fixed: Mask | None,
 ) -> ChosenShift | UntoldShift:
     """The shift of a periodic specimen that its defects tell, or why it is not told.
 
@@ -244,9 +244,9 @@ def choose_period(
             best = other
     predicted = _find_predicted(compared, periods, guess, spread)
     usual = None if is_fine(periods, level.size) else predicted
-    if usual is not best and spread is not None and usual is not None:
+    if usual is not None and usual is not best and not _is_expected(usual, guess, spread):
         # A stage may have moved by nearly a period.
-        usual = usual if _is_expected(usual, guess, spread) else None
+        usual = None
     if usual is not None and (usual is best or not _tells(best, usual, EVIDENCE_MIN)):
         best, rejection = usual, _find_flaw(usual, periods, noise)
     else:
@@ -452,10 +452,13 @@ def _find_predicted(
     return compared[nearest] if distances[nearest] < 0.25 * shortest else None
 
 
-def _is_expected(candidate: _Candidate, guess: Array, spread: Array) -> bool:
+def _is_expected(candidate: _Candidate, guess: Array, spread: Array | None) -> bool:
     """Whether a shift is where it was predicted."""
     left = candidate.shift_px - guess
-    return float(left @ np.linalg.solve(spread, left)) <= PERIODS_REACH_SIGMAS**2
+    return (
+        spread is not None
+        and float(left @ np.linalg.solve(spread, left)) <= PERIODS_REACH_SIGMAS**2
+    )
 
 
 def _list_shifts(

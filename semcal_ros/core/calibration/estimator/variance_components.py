@@ -100,27 +100,25 @@ def limit_components(setup: Setup, found: VarianceComponents) -> VarianceCompone
     def least(a: Spread, b: Spread) -> Spread:
         return a if a.sigma <= b.sigma else b
 
-    lattice = found.lattice_sigma
-    if lattice is not None and usual.lattice_sigma is not None:
-        lattice = np.minimum(lattice, usual.lattice_sigma)
     return replace(
-        found,
+        limit_lattices(setup, found, 1.0),
         scale=least(found.scale, usual.scale),
         visit_height=least(found.visit_height, usual.visit_height),
         drift_sigma_px=np.minimum(found.drift_sigma_px, usual.drift_sigma_px),
-        lattice_sigma=lattice,
     )
 
 
-def limit_lattices(setup: Setup, found: VarianceComponents) -> VarianceComponents:
-    """Return spreads of which that of the lattices is at most :data:`CHOICE_LATTICES_MAX` usual ones.
+def limit_lattices(
+    setup: Setup, found: VarianceComponents, most: float = CHOICE_LATTICES_MAX
+) -> VarianceComponents:
+    """Return spreads of which that of the lattices is at most so many usual ones.
 
-    For the choice of coefficients: under a wider one, what the model does not have yet passes for stretched lattices,
-    for which tilts make room, and is never missed.
+    By default as for the choice of coefficients: under a wider one, what the model does not have yet passes for
+    stretched lattices, for which tilts make room, and is never missed.
     """
     if found.lattice_sigma is None:
         return found
-    largest = CHOICE_LATTICES_MAX * usual_lattice_sigmas(setup.priors)
+    largest = most * usual_lattice_sigmas(setup.priors)
     return replace(found, lattice_sigma=np.minimum(found.lattice_sigma, largest))
 
 

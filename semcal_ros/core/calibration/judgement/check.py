@@ -374,17 +374,15 @@ def _at_views(model: CalibrationModel, setup: Setup, name: str) -> Array:
 
 def _estimate_changes(revision: Revision) -> _Estimate:
     model, setup = revision.model, revision.setup
-    names, gains = changing(model), gaining(model)
-    own = np.r_[revision.changes, revision.gains]
+    names, index = changing(model), np.r_[revision.gains]
+    is_free = revision.problem.prior_sigma[index] > HELD_SIGMA
+    gains = [p for p, free in zip(gaining(model), is_free, strict=True) if free]
+    own = np.r_[revision.changes, index[is_free]]
     sigmas = revision.problem.prior_sigma[own]
-    free = np.append(np.ones(len(names), dtype=bool), sigmas[len(names) :] > HELD_SIGMA)
-    information = np.zeros((len(own), len(own)))
-    information[np.ix_(free, free)] = np.linalg.inv(
-        revision.covariance[np.ix_(own[free], own[free])]
-    )
+    information = np.asarray(np.linalg.inv(revision.covariance[np.ix_(own, own)]), dtype=np.float64)
     groups = {}
     for name, parameters in groups_of_changes(model).items():
-        relative = [p for p in parameters if p in gains and free[len(names) + gains.index(p)]]
+        relative = [p for p in parameters if p in gains]
         columns = [names.index(p) for p in parameters]
         columns += [len(names) + gains.index(p) for p in relative]
         values = np.eye(len(parameters), len(columns))
