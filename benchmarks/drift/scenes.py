@@ -353,6 +353,23 @@ def shadow(frame: Frame, k: int, rng: Rng) -> Frame:
     return Frame(frame.picture * dark, frame.shown)
 
 
+def soft_shadow(frame: Frame, k: int, rng: Rng) -> Frame:
+    """As soft, as dark and as wide as chance has it, which sweeps over the field in any direction."""
+    softness, depth, angle = (
+        np.exp(rng.uniform(1.1, 3.4)),
+        rng.uniform(0.25, 0.65),
+        rng.uniform(0, 2 * np.pi),
+    )
+    wide = rng.choice([1e4, rng.uniform(60.0, 200.0)])
+    front = rng.uniform(-0.6, 0.2) * SIZE + rng.uniform(2.0, 10.0) * k
+    y, x = np.mgrid[:SIZE, :SIZE] - 0.5 * SIZE
+    behind = front - x * np.cos(angle) - y * np.sin(angle)
+    inside, gone = (
+        1.0 / (1.0 + np.exp(np.clip(-b / softness, -50.0, 50.0))) for b in (behind, behind - wide)
+    )
+    return Frame(frame.picture * (1.0 - depth * (inside - gone)), frame.shown)
+
+
 def data_bar(frame: Frame, k: int, rng: Rng) -> Frame:
     drawn, shown = np.full((SIZE, SIZE), np.nan), frame.shown.copy()
     bar = np.zeros((36, SIZE))
@@ -491,6 +508,9 @@ KINDS: dict[str, Kind] = {
     "tool at rest over few": Kind(few, tool_at_rest),
     "ball over few": Kind(few, rolling),
     "shadow": Kind(gold, shadow),
+    "soft shadow over gold": Kind(gold, soft_shadow),
+    "soft shadow over holes": Kind(holes, soft_shadow),
+    "soft shadow over fibres": Kind(fibres, soft_shadow),
     "data bar": Kind(gold, data_bar),
     "counter over powder": Kind(powder, counter_in_bar),
     "hum over gold": Kind(gold, hum),

@@ -217,6 +217,15 @@ class Alignment:
         comparison = self._comparison
         return None if comparison is None else comparison.tiles
 
+    def compared_tiles(self) -> tuple[TileWindow, TileSums, Array] | None:
+        """The compared tiles of the reference, their sums whatever their weights, and the shift (2,) of these; None
+        where nothing was compared.
+        """
+        comparison = self._comparison
+        return (
+            None if comparison is None else (comparison.window, comparison.plain, comparison.shift)
+        )
+
     def row_power(self, modes: int) -> Array | None:
         """(2, k, 2) power of the shifts of the rows of tiles about a straight line, px^2 per row, in the
         lowest cosine modes down the frame, k = ``modes`` or as many as there are rows for; and the same of

@@ -30,7 +30,9 @@ parts move differently and nothing says which is the specimen, and on images who
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,11 +40,12 @@ from numpy.typing import ArrayLike
 from semcal_ros.core.arrays import RESAMPLED_TYPES, AnyImage, Array, Mask, check_image
 from semcal_ros.core.errors import InvalidValueError, Rejection
 from semcal_ros.core.registration.acceptance import find_failure
-from semcal_ros.core.registration.agreement import MovingTiles
+from semcal_ros.core.registration.agreement import MovingTiles, TileNoise
 from semcal_ros.core.registration.ambiguity import choose_peak, compare_residuals
 from semcal_ros.core.registration.defects import ChosenShift, choose_period
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.fixed_pixels import drop_fixed_pixels
+from semcal_ros.core.registration.illumination import measure_illumination
 from semcal_ros.core.registration.inverse_compositional import (
     Alignment,
     SimilarityFit,
@@ -81,6 +84,9 @@ from semcal_ros.core.registration.thresholds import (
     FARTHER_PX,
     GREY_LEVEL_MAX,
     LEVEL_PX_MIN,
+    LIGHT_GUESS_PX_MAX,
+    LIGHT_KEPT_LEAST,
+    LIGHT_KEPT_MIN,
     NOISE_ERROR,
     PARTS_SIGNAL_MIN,
     PULL_PX_MAX,
@@ -101,6 +107,11 @@ _SIGNS_OF_DEFORMATION = frozenset(
         MatchFailure.STAGES_DISAGREE,
         MatchFailure.DISSIMILAR,
     }
+)
+
+# What another light would not mend: it does not say which of several motions is the specimen's.
+_WHATEVER_THE_LIGHT = frozenset(
+    {MatchFailure.UNUSABLE_REFERENCE, MatchFailure.UNUSABLE_IMAGE, MatchFailure.AMBIGUOUS}
 )
 
 
@@ -148,6 +159,7 @@ class Registration:
     contrast: float = float("nan")
     suggested_px: Array = field(default_factory=lambda: np.full(2, np.nan))
 
+    _image_noise: float = field(default=float("nan"), repr=False)
     _middle_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
     _origin_px: Array = field(default_factory=lambda: np.zeros(2), repr=False)
 
@@ -160,6 +172,17 @@ class Registration:
             return None
         about = fit.about(self._middle_px)
         return replace(about, values=about.values + np.append(self._origin_px, np.zeros(4)))
+
+    def widened(self, covariance: Array) -> Registration:
+        """The same with a shift that is less certain by a covariance (2, 2)."""
+        joint = self.alignment.joint_covariance.copy()
+        joint[:2, :2] += covariance
+        alignment = replace(
+            self.alignment,
+            covariance=self.alignment.covariance + covariance,
+            joint_covariance=joint,
+        )
+        return replace(self, alignment=alignment)
 
     @property
     def accepted(self) -> bool:
@@ -416,9 +439,9 @@ def register(
     dropped_at = np.asarray(guess_px, dtype=np.float64)
     for _ in range(DROPPED_MAX):
         part = drop_fixed_pixels(reference, fixed, image_region, dropped_at)
-        found = _register(
+        measure = partial(
+            _register,
             part,
-            image,
             guess_px=guess_px,
             guess_covariance=guess_covariance,
             image_region=image_region,
@@ -426,6 +449,9 @@ def register(
             max_stretch=max_stretch,
             suspected=suspected,
             fixed=fixed,
+        )
+        found = _register_in_its_light(
+            part, image, measure, guess_px, guess_covariance, image_region
         )
         away_px = np.abs(found.shift_px - dropped_at)
         if part is reference or not np.any(away_px > DROPPED_WITHIN_PX):
@@ -520,6 +546,69 @@ def _register_across(
         rejection = refuse_unless_followed(reference, alignment, image_noise, follow_px)
     moved = replace(alignment, shift_px=alignment.shift_px + origin)
     return Registration(moved, correlation, rejection, along=lines.along, contrast=signals.contrast)
+
+
+def _register_in_its_light(
+    reference: Reference,
+    image: ArrayLike,
+    measure: Callable[[ArrayLike], Registration],
+    guess_px: ArrayLike,
+    guess_covariance: ArrayLike | None,
+    image_region: Region | None,
+) -> Registration:
+    """Measure a shift in both directions, also of an image that is lit otherwise than the reference."""
+    found = measure(image)
+    if found.rejection is not None and found.rejection.status in _WHATEVER_THE_LIGHT:
+        return found
+    gray, inside = _crop(image, image_region)
+    level, pyramid = reference.levels[-1], Pyramid(gray)
+    origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)
+    image_noise = found._image_noise
+    if not np.isfinite(image_noise):
+        image_noise = estimate_noise_variance(_texture(gray, inside, reference.settings))
+    noise = TileNoise.of(level.sigma_px, reference.noise_variance, image_noise)
+    compared, light = found.alignment.compared_tiles(), None
+    sigma_px = np.inf
+    if guess_covariance is not None:
+        values = np.linalg.eigvalsh(np.asarray(guess_covariance, dtype=np.float64))
+        sigma_px = float(np.sqrt(values[-1]))
+    if compared is not None and (found.accepted or sigma_px >= LIGHT_GUESS_PX_MAX):
+        at_px = compared[2]
+        light = measure_illumination(level, pyramid, at_px, noise, compared[:2])
+    elif sigma_px < LIGHT_GUESS_PX_MAX:
+        at_px = np.asarray(guess_px, dtype=np.float64) - origin
+        light = measure_illumination(level, pyramid, at_px, noise)
+    if light is None:
+        return found
+    gray = to_gray(image)
+    evened = measure(light.even_out(gray, inside))
+    if not np.all(np.isfinite(evened.shift_px)):
+        return found if found.accepted else evened
+    # A plane over each tile took its part of the way to the right shift, too.
+    moved = (evened.shift_px - origin - at_px) / np.maximum(light.kept, LIGHT_KEPT_LEAST)
+    if np.min(light.kept) < LIGHT_KEPT_MIN or not light.is_sure:
+        return _allow_for_light(found, moved)
+    light_there = measure_illumination(level, pyramid, at_px + moved, noise)
+    if light_there is not None:
+        light, evened = light_there, measure(light_there.even_out(gray, inside))
+    if found.accepted and not evened.accepted:
+        return found
+    kept = np.maximum(light.kept, LIGHT_KEPT_MIN)
+    more = evened.covariance * (1.0 / np.sqrt(np.outer(kept, kept)) - 1.0)
+    # By how much the next light would move it.
+    remaining = (evened.shift_px - origin - at_px - moved) * (1.0 / kept - 1.0)
+    return evened.widened(more + np.outer(remaining, remaining))
+
+
+def _allow_for_light(found: Registration, moved_px: Array) -> Registration:
+    """A registration with a covariance that has by how much another light would move it; a rejection where that is too
+    much.
+    """
+    widened, size = found.widened(np.outer(moved_px, moved_px)), float(np.hypot(*moved_px))
+    if size <= PULL_PX_MAX or not found.accepted:
+        return widened
+    reason = f"ambiguous: if its light has changed, the shift is another one by {size:.1f} px"
+    return replace(widened, rejection=Rejection(MatchFailure.AMBIGUOUS, reason))
 
 
 def _register(
@@ -700,6 +789,7 @@ def _register(
         moving=moving,
         share=share,
         contrast=signals.contrast,
+        _image_noise=image_noise,
         _middle_px=middle.astype(np.float64),
         _origin_px=origin,
     )

@@ -204,6 +204,54 @@ NOISE_PATCHES = TABLE.stated(
     "Along each axis, in which the noise is measured.",
 )
 
+# Light that is not that of the reference, in illumination.py and register.py
+
+LIGHT_RATIO_MIN = TABLE.stated(
+    "LIGHT_RATIO_MIN", 1.15, "of what a gain and a plane for each tile leave",
+    "That one for all tiles leave, beyond what so many more terms explain by chance.",
+)
+LIGHT_NOISE_MIN = TABLE.stated(
+    "LIGHT_NOISE_MIN", 0.2, "of the variance of the noise",
+    "That planes over tiles leave; where smoothing leaves less, they leave nothing of the specimen.",
+)
+LIGHT_SHARE_MIN = TABLE.stated(
+    "LIGHT_SHARE_MIN", 0.3, "of the tiles",
+    "That agree but for their light; of fewer, the rest of an image would be drawn.",
+)
+LIGHT_GAIN_CHANGE = TABLE.stated(
+    "LIGHT_GAIN_CHANGE", 0.3, "of the usual gain",
+    "1-sigma to which the gain of a tile is known before it is measured.",
+)
+LIGHT_GAIN_RATIO_MAX = TABLE.stated(
+    "LIGHT_GAIN_RATIO_MAX", 3.0, "of the usual gain",
+    "To either side, of the gain of a tile: noise is made as much larger where it is dark.",
+)
+RICH_SIGMAS = TABLE.derived(
+    "RICH_SIGMAS", 13.5, "sigma",
+    "Of the noise by which a tile stands out that tells a gain: chosen by its own noise, it is 7 % off at most.",
+)
+LIGHT_GROUPS = TABLE.stated(
+    "LIGHT_GROUPS", 5, "groups",
+    "Of tiles of one brightness, each of which tells whether the specimen is seen there.",
+)
+COVERED_SIGMAS = TABLE.derived(
+    "COVERED_SIGMAS", 2.5, "sigma",
+    "By which tiles have less in common with the specimen than half of what the darkest shadow leaves, or surely "
+    "more than nothing: by chance one in 160.",
+)
+LIGHT_KEPT_MIN = TABLE.stated(
+    "LIGHT_KEPT_MIN", 0.3, "of the squares of the gradients",
+    "That a plane over each tile must leave to tell a shift; of less, the shift is as uncertain as light moves it.",
+)
+LIGHT_KEPT_LEAST = TABLE.cost(
+    "LIGHT_KEPT_LEAST", 0.05, "of the squares of the gradients",
+    "By which a step is divided that light took its part of; keeps it finite where there is nothing.",
+)
+LIGHT_GUESS_PX_MAX = TABLE.stated(
+    "LIGHT_GUESS_PX_MAX", 2.0, "px",
+    "1-sigma of a predicted shift at which the light of an image is measured that has none of its own.",
+)
+
 # Tiles that agree with a shift, in agreement.py
 
 MISSING_MAX = TABLE.stated(

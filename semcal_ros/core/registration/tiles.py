@@ -121,6 +121,23 @@ class PyramidLevel:
         return np.asarray(np.einsum("rckn,rckn->rcn", slopes, slopes))
 
     @cached_property
+    def plane_terms(self) -> Image:
+        """(n, 3) one, x and y at the pixels of a tile, orthonormal."""
+        x, y = (np.arange(side) - 0.5 * (side - 1) for side in self.side)
+        ones = np.ones(self.side[0] * self.side[1])
+        terms = np.stack([ones, np.tile(x, len(y)), np.repeat(y, len(x))], axis=1)
+        return np.asarray(terms / np.linalg.norm(terms, axis=0), dtype=np.float32)
+
+    @cached_property
+    def planes(self) -> Array:
+        """(rows, cols, 3, 3) products of gradient by x, by y and grey level with :attr:`plane_terms`, also of pixels
+        that do not count.
+        """
+        if self.undropped is not None:
+            return self.undropped.planes
+        return np.asarray(self.products @ self.plane_terms, dtype=np.float64)
+
+    @cached_property
     def noise_products(self) -> Array:
         """(rows, cols, 2, 2) each tile's part in the covariance of the sum over tiles of the products of gradients with
         white noise of which, after the smoothing, variance one is left.
