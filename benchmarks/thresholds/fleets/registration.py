@@ -60,6 +60,10 @@ SCENES = {
     "tool over sparse from the start": (0, (3, 5, 7, 9), 1.0),
     "ball over few": (0, (2, 5, 7, 9), 1.0),
     "data bar": (0, (2, 4, 6, 8), 1.0),
+    "shadow": (0, (3, 6, 9), 0.5),
+    "soft shadow over gold": (0, (3, 6, 9), 0.5),
+    "soft shadow over holes": (0, (3, 6, 9), 0.5),
+    "tool over faint ground": (4, (6, 8), 1.0),
 }
 SCENE_PX, FRAMES, SEED = 256, 10, 100
 BAR_PX = 36

@@ -18,13 +18,14 @@ A shadow that falls on a specimen, and a charge that builds up, change gain and 
 along the plane that least squares (:mod:`.inverse_compositional`) allow for. What they leave has slopes, which pull the
 shift: a gain that rises along x has a product with the gradient along x.
 
-Here each tile has a gain and a plane of brightness of its own. The light differs where these leave clearly less of the
-image than one gain and one plane do for all tiles, beyond what so many more terms explain by chance. Only tiles that
-agree but for their light count, and of these the largest body: a tool shows something else. Between the middles of
-tiles, the light is interpolated.
+Here each tile has a gain and a brightness of its own. The light differs where those that the tiles around each one
+foretell leave clearly less of the image than one gain and one plane do for all: light is smooth, and what changes from
+tile to tile is none. Only tiles that agree but for their light count, and of these the largest body: a tool shows
+something else. Between the middles of tiles, the light is interpolated.
 
-What a plane over each tile explains does not tell a shift any more. It fails where this is most of the specimen's
-gradients, as of clouds: then nothing says what is light and what is specimen (:attr:`Illumination.kept`).
+What follows the light from tile to tile does not tell a shift any more. It fails where this is most of the specimen's
+gradients, as of clouds: then nothing says what is light and what is specimen (:attr:`Illumination.kept`). And it does
+not tell a tool from light on a specimen that is too faint to be seen missing (:attr:`Illumination.is_sure`).
 """
 
 from __future__ import annotations
@@ -43,12 +44,13 @@ from semcal_ros.core.registration.thresholds import (
     BESIDES_MAX,
     COVERED_SIGMAS,
     GAIN_MIN,
+    LIGHT_EXCESS_MIN,
     LIGHT_GAIN_CHANGE,
     LIGHT_GAIN_RATIO_MAX,
     LIGHT_GROUPS,
     LIGHT_NOISE_MIN,
-    LIGHT_RATIO_MIN,
     LIGHT_SHARE_MIN,
+    LIGHT_SIGMAS,
     MISSING_MAX,
     RICH_SIGMAS,
     TELLING_TILES_MIN,
@@ -61,13 +63,6 @@ from semcal_ros.core.registration.tiles import (
     tile_sums,
     tile_window,
 )
-
-# The binomial weights of a tile and of those around.
-_AROUND = np.outer([0.5, 1.0, 0.5], [0.5, 1.0, 0.5])
-# The same of those around alone.
-_BESIDE = _AROUND - np.diag([0.0, 1.0, 0.0])
-# The mean of the four beside a tile.
-_CROSS = np.array([[0.0, 0.25, 0.0], [0.25, 0.0, 0.25], [0.0, 0.25, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -83,7 +78,8 @@ class Illumination:
     corner_px, side_px
         (2,) left and top of the first tile in the image, and width and height of a tile.
     kept
-        (2,) part of the squares of the gradients along x and y that a plane over each tile does not explain.
+        (2,) part of the squares of the gradients along x and y that does not follow the light from tile to tile, and
+        tells a shift.
     is_sure
         Whether the specimen is surely seen in all of that light, and nothing that covers it.
     """
@@ -108,6 +104,8 @@ class Illumination:
             np.asarray(by_y @ plane.astype(np.float32) @ by_x.T)
             for plane in (self.gain, self.offset)
         )
+        # A cubic overshoots.
+        gain = np.clip(gain, 1.0 / LIGHT_GAIN_RATIO_MAX, LIGHT_GAIN_RATIO_MAX)
         mean = np.float32(image[top:bottom, left:right].mean(dtype=np.float64))
         return np.asarray((image.astype(np.float32) - mean - offset) / gain + mean)
 
@@ -183,7 +181,8 @@ class _Tiles:
         """(rows, cols) gain of those tiles around each one that count, with weights (3, 3): as far as their structure
         tells it, and the usual one else.
         """
-        errors = self.shared * (self.noise.image + self.usual**2 * self.noise.reference)
+        noise = self.noise.image + self.usual**2 * self.noise.reference
+        errors = max(self.shared * noise, 1e-30)
         precision = 1.0 / (LIGHT_GAIN_CHANGE * self.usual) ** 2
         common, structure = (
             _pool(np.where(counts, part, 0.0), weights) / errors
@@ -243,8 +242,10 @@ def measure_illumination(
     gain, agrees = _find_gains(tiles, free, pixels == np.max(pixels))
     if agrees.mean() < LIGHT_SHARE_MIN:
         return None
-    slopes = (seen - usual_gain * planes[..., 2, :])[..., 1:]
-    if _compare_with_foretold(tiles, level.side, agrees, offset, slopes) < LIGHT_RATIO_MIN:
+    # Of smoothed noise, few pixels are independent.
+    by_chance = LIGHT_SIGMAS * np.sqrt(2.0 * tiles.shared / float(np.sum(pixels[agrees])))
+    excess = _compare_with_foretold(tiles, level.side, agrees, seen, planes[..., 2, :]) - 1.0
+    if excess < max(LIGHT_EXCESS_MIN, by_chance):
         return None
     is_sure = _is_seen_everywhere(tiles, agrees, offset)
     of_gradients = planes[..., :2, :]
@@ -298,13 +299,12 @@ def _find_usual_gain(common: Array, structure: Array, chance: Array) -> float:
 
 
 def _compare_with_foretold(
-    tiles: _Tiles, side: tuple[int, int], agrees: Mask, offset: Array, slopes: Array
+    tiles: _Tiles, side: tuple[int, int], agrees: Mask, image: Array, reference: Array
 ) -> float:
     """What one gain and one plane of brightness leave over what is left by those that the tiles around each one
     foretell; 0 where too few tiles lie amid others. What changes from tile to tile cannot be foretold.
 
-    ``offset`` (rows, cols) and ``slopes`` (rows, cols, 2) are what the usual gain leaves of the means of tiles, and of
-    their slopes along x and y in the orthonormal terms of a plane.
+    ``image`` and ``reference`` (rows, cols, 3) are the planes over tiles, in orthonormal terms.
     """
     amid = cv2.erode(
         agrees.astype(np.uint8),
@@ -315,17 +315,32 @@ def _compare_with_foretold(
     inner = amid > 0
     if np.count_nonzero(inner) < TELLING_TILES_MIN:
         return 0.0
-    y, x = np.indices(offset.shape, dtype=np.float64)
-    design = np.stack([np.ones(x.shape), x, y], axis=-1)
-    terms = np.linalg.lstsq(design[inner], offset[inner], rcond=None)[0]
-    offset, slopes = offset - design @ terms, slopes - terms[1:] * _rise(side)
-    mean = cv2.filter2D(offset, -1, _CROSS, borderType=cv2.BORDER_REPLICATE)
-    foretold = _interpolate_planes(offset[..., None], side)[..., 0, 1:]
-    gain = tiles.pool_gain(agrees, _BESIDE)
-    before = tiles.left(tiles.usual) + tiles.pixels * offset**2 + np.sum(slopes**2, axis=-1)
-    after = tiles.left(gain) + tiles.pixels * (offset - mean) ** 2
-    after += np.sum((slopes - foretold) ** 2, axis=-1)
+    image, reference = (_without_plane(part, inner, side) for part in (image, reference))
+    common = np.sum((tiles.common + np.sum(image * reference, axis=-1))[inner])
+    usual = float(common / np.sum((tiles.reference + np.sum(reference**2, axis=-1))[inner]))
+    rest = image - usual * reference
+    foretold = _interpolate_planes(rest[..., :1] / np.sqrt(side[0] * side[1]), side)[..., 0, :]
+    means = rest[..., 0]
+    beside = [np.roll(means, by, axis) for axis in (0, 1) for by in (-1, 1)]
+    foretold[..., 0] = np.mean(beside, axis=0)
+    before = tiles.left(usual) + np.sum(rest**2, axis=-1)
+    after = tiles.left(tiles.pool_gain(agrees, _around() - _middle())) + np.sum(
+        (rest - foretold) ** 2, axis=-1
+    )
     return float(before[inner].sum()) / max(float(after[inner].sum()), 1e-30)
+
+
+def _without_plane(planes: Array, inner: Mask, side: tuple[int, int]) -> Array:
+    """Planes over tiles (rows, cols, 3), in orthonormal terms, without the one over the field that fits the means of
+    the ``inner`` tiles (rows, cols) best.
+    """
+    y, x = np.indices(inner.shape, dtype=np.float64)
+    design, area = np.stack([np.ones(x.shape), x, y], axis=-1), np.sqrt(side[0] * side[1])
+    terms = np.linalg.lstsq(design[inner], planes[inner, 0], rcond=None)[0]
+    left = planes.copy()
+    left[..., 0] -= design @ terms
+    left[..., 1:] -= terms[1:] / area * _rise(side)
+    return left
 
 
 def _rise(side: tuple[int, int]) -> Array:
@@ -358,7 +373,7 @@ def _find_gains(tiles: _Tiles, free: Array, whole: Mask) -> tuple[Array, Mask]:
     noise, seen = tiles.noise, _may_be_seen(tiles, whole)
     agrees = seen
     for _ in range(2):
-        gain = tiles.pool_gain(agrees, _AROUND)
+        gain = tiles.pool_gain(agrees, _around())
         expected = gain**2 * np.maximum(tiles.structure, 0.0)
         floor = gain**2 * noise.reference + noise.image
         scatter = np.sqrt(tiles.shared * (tiles.pixels * floor**2 + 2.0 * expected * floor))
@@ -379,7 +394,7 @@ def _may_be_seen(tiles: _Tiles, whole: Mask) -> Mask:
     with it.
     """
     seen = whole
-    for weights in (np.ones((1, 1)), np.ones((3, 3))):
+    for weights in (_middle(), np.ones((3, 3))):
         more = _pool(tiles.common - tiles.least * tiles.structure, weights)
         seen = seen & (more > -COVERED_SIGMAS * np.sqrt(_pool(tiles.scatter2, weights)))
     return seen
@@ -402,7 +417,17 @@ def _is_seen_everywhere(tiles: _Tiles, agrees: Mask, offset: Array) -> bool:
     return bool(np.all(common > surely))
 
 
-def _pool(values: Array, weights: Array = _AROUND) -> Array:
+def _around() -> Array:
+    """(3, 3) binomial weights of a tile and those around, one in the middle."""
+    return np.outer([0.5, 1.0, 0.5], [0.5, 1.0, 0.5])
+
+
+def _middle() -> Array:
+    """(3, 3) weights of a tile alone."""
+    return np.diag([0.0, 1.0, 0.0])
+
+
+def _pool(values: Array, weights: Array) -> Array:
     """Sums over each tile and those around, with weights (3, 3)."""
     return np.asarray(cv2.filter2D(values, -1, weights, borderType=cv2.BORDER_CONSTANT))
 
@@ -411,9 +436,9 @@ def _fill(values: Array, known: Mask) -> Array:
     """Values (rows, cols), from around where they are not known."""
     filled, weight = np.where(known, values, 0.0), known.astype(np.float64)
     while not np.all(weight > 0.0):
-        around = _pool(weight)
+        around = _pool(weight, _around())
         reached = (weight <= 0.0) & (around > 0.0)
-        mean = _pool(filled * weight) / np.maximum(around, 1e-30)
+        mean = _pool(filled * weight, _around()) / np.maximum(around, 1e-30)
         filled = np.where(reached, mean, filled)
         weight = np.where(reached, 1.0, weight)
     return filled

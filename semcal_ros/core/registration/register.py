@@ -584,7 +584,7 @@ def _register_in_its_light(
     evened = measure(light.even_out(gray, inside))
     if not np.all(np.isfinite(evened.shift_px)):
         return found if found.accepted else evened
-    # A plane over each tile took its part of the way to the right shift, too.
+    # Light took its part of the way to the right shift.
     moved = (evened.shift_px - origin - at_px) / np.maximum(light.kept, LIGHT_KEPT_LEAST)
     if np.min(light.kept) < LIGHT_KEPT_MIN or not light.is_sure:
         return _allow_for_light(found, moved)

@@ -206,9 +206,16 @@ NOISE_PATCHES = TABLE.stated(
 
 # Light that is not that of the reference, in illumination.py and register.py
 
-LIGHT_RATIO_MIN = TABLE.stated(
-    "LIGHT_RATIO_MIN", 1.15, "of what a gain and a plane for each tile leave",
-    "That one for all tiles leave, beyond what so many more terms explain by chance.",
+LIGHT_EXCESS_MIN = TABLE.measured(
+    "LIGHT_EXCESS_MIN", 0.15, "of what the light that neighbours foretell leaves",
+    "That one gain and one plane leave more. 1.5 times as large, it changes nothing in 26 cases; as small, 1 of 26 "
+    "cases is decided otherwise and errors change by 0.5 %.",
+    command=BODIES_TRIED,
+)
+LIGHT_SIGMAS = TABLE.derived(
+    "LIGHT_SIGMAS", 5.0, "sigma",
+    "By which it is more than chance: the variance of smoothed noise over that of independent noise of n pixels is "
+    "known to the square root of 2 / n; more is one in 3.5 million.",
 )
 LIGHT_NOISE_MIN = TABLE.stated(
     "LIGHT_NOISE_MIN", 0.2, "of the variance of the noise",
@@ -218,13 +225,17 @@ LIGHT_SHARE_MIN = TABLE.stated(
     "LIGHT_SHARE_MIN", 0.3, "of the tiles",
     "That agree but for their light; of fewer, the rest of an image would be drawn.",
 )
-LIGHT_GAIN_CHANGE = TABLE.stated(
+LIGHT_GAIN_CHANGE = TABLE.measured(
     "LIGHT_GAIN_CHANGE", 0.3, "of the usual gain",
-    "1-sigma to which the gain of a tile is known before it is measured.",
+    "1-sigma to which the gain of a tile is known before it is measured. 1.5 times as large or as small, 25 cases are "
+    "decided alike; as small, errors are 9 % larger.",
+    command=BODIES_TRIED,
 )
-LIGHT_GAIN_RATIO_MAX = TABLE.stated(
+LIGHT_GAIN_RATIO_MAX = TABLE.measured(
     "LIGHT_GAIN_RATIO_MAX", 3.0, "of the usual gain",
-    "To either side, of the gain of a tile: noise is made as much larger where it is dark.",
+    "To either side, of the gain of a tile: noise is made as much larger where it is dark. 1.5 times as large, errors "
+    "change by 1.1 %; as small, 1 of 25 cases is decided otherwise and errors are 10 % larger.",
+    command=BODIES_TRIED,
 )
 RICH_SIGMAS = TABLE.derived(
     "RICH_SIGMAS", 13.5, "sigma",
@@ -232,16 +243,19 @@ RICH_SIGMAS = TABLE.derived(
 )
 LIGHT_GROUPS = TABLE.stated(
     "LIGHT_GROUPS", 5, "groups",
-    "Of tiles of one brightness, each of which tells whether the specimen is seen there.",
+    "Of tiles of one brightness, each of which tells whether the specimen is seen there. With 3, errors of 8 cases are "
+    "11 % smaller, and a tool is more easily taken for light.",
 )
 COVERED_SIGMAS = TABLE.derived(
     "COVERED_SIGMAS", 2.5, "sigma",
     "By which tiles have less in common with the specimen than half of what the darkest shadow leaves, or surely "
     "more than nothing: by chance one in 160.",
 )
-LIGHT_KEPT_MIN = TABLE.stated(
+LIGHT_KEPT_MIN = TABLE.measured(
     "LIGHT_KEPT_MIN", 0.3, "of the squares of the gradients",
-    "That a plane over each tile must leave to tell a shift; of less, the shift is as uncertain as light moves it.",
+    "That must tell a shift beside light that is free; of less, the shift is as uncertain as light moves it. 1.5 times "
+    "as large or as small, 31 cases are decided alike, and errors change by 1.2 % at most.",
+    command=BODIES_TRIED,
 )
 LIGHT_KEPT_LEAST = TABLE.cost(
     "LIGHT_KEPT_LEAST", 0.05, "of the squares of the gradients",

@@ -101,6 +101,16 @@ def test_light_that_has_not_changed_is_left_alone(seed: int) -> None:
     assert _measure(_with_noise(truth, rng), _with_noise(image, rng))[1] is None
 
 
+def test_images_without_noise_have_their_light_measured_too() -> None:
+    truth = _texture(np.random.default_rng(7))
+    level = prepare_reference(truth).levels[-1]
+    noise = TileNoise.of(level.sigma_px, 0.0, 0.0)
+    images = [Pyramid(np.float32(through * truth)) for through in (1.0, _shadow(0.5, 12.0))]
+    same, shadowed = (measure_illumination(level, i, np.zeros(2), noise) for i in images)
+    assert same is None
+    assert shadowed is not None
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_what_covers_the_specimen_is_no_light(seed: int) -> None:
     rng = np.random.default_rng(seed)
