@@ -53,6 +53,7 @@ from semcal_ros.core.registration.thresholds import (
     LIGHT_SIGMAS,
     MISSING_MAX,
     RICH_SIGMAS,
+    STRUCTURE_MIN,
     TELLING_TILES_MIN,
 )
 from semcal_ros.core.registration.tiles import (
@@ -224,7 +225,7 @@ def measure_illumination(
     common = sums.cross[..., 2] - np.sum(planes[..., 2, :] * seen, axis=-1)
     structure = reference - free * noise.reference
     chance = noise.reference * np.sqrt(2.0 * shared_pixels(level.sigma_px) * pixels)
-    usual_gain = _find_usual_gain(common, structure, chance)
+    usual_gain = _find_usual_gain(common, structure, noise.reference * free, chance)
     if not GAIN_MIN < usual_gain < 1.0 / GAIN_MIN:
         return None
     tiles = _Tiles(
@@ -285,9 +286,10 @@ def _left_of_noise(side: tuple[int, int], sigma_px: float) -> float:
     return 1.0 - means[0] * means[1] - slopes[0] * means[1] - means[0] * slopes[1]
 
 
-def _find_usual_gain(common: Array, structure: Array, chance: Array) -> float:
+def _find_usual_gain(common: Array, structure: Array, by_noise: Array, chance: Array) -> float:
     """The gain of the median tile, from products (rows, cols) of reference and image and the squares of the reference
-    without its noise, of which ``chance`` is a standard deviation; that of all tiles together where few are sure.
+    without those ``by_noise``, of which ``chance`` is a standard deviation. That of all tiles together where few are
+    sure, and 0 where noise hides it.
     """
     # Of tiles that barely stand out, those are chosen whose noise adds to their structure.
     rich = structure > RICH_SIGMAS * chance
@@ -295,7 +297,10 @@ def _find_usual_gain(common: Array, structure: Array, chance: Array) -> float:
     ratios = ratios[ratios > GAIN_MIN]
     if len(ratios) >= TELLING_TILES_MIN:
         return median(ratios)
-    return float(np.sum(common)) / max(float(np.sum(structure)), 1e-30)
+    print("totals", np.sum(structure) / np.sum(by_noise))
+    if np.sum(structure) < STRUCTURE_MIN * np.sum(by_noise):
+        return 0.0
+    return float(np.sum(common) / np.sum(structure))
 
 
 def _compare_with_foretold(
@@ -316,17 +321,20 @@ def _compare_with_foretold(
     if np.count_nonzero(inner) < TELLING_TILES_MIN:
         return 0.0
     image, reference = (_without_plane(part, inner, side) for part in (image, reference))
-    common = np.sum((tiles.common + np.sum(image * reference, axis=-1))[inner])
-    usual = float(common / np.sum((tiles.reference + np.sum(reference**2, axis=-1))[inner]))
+    common = float(np.sum((tiles.common + np.sum(image * reference, axis=-1))[inner]))
+    squares = float(np.sum((tiles.reference + np.sum(reference**2, axis=-1))[inner]))
+    # With its noise, the gain would leave a part of a coarse structure, which neighbours foretell.
+    structure = squares - tiles.noise.reference * float(np.sum(tiles.pixels[inner]))
+    usual = common / max(structure, 0.1 * squares)
     rest = image - usual * reference
     foretold = _interpolate_planes(rest[..., :1] / np.sqrt(side[0] * side[1]), side)[..., 0, :]
     means = rest[..., 0]
     beside = [np.roll(means, by, axis) for axis in (0, 1) for by in (-1, 1)]
     foretold[..., 0] = np.mean(beside, axis=0)
     before = tiles.left(usual) + np.sum(rest**2, axis=-1)
-    after = tiles.left(tiles.pool_gain(agrees, _around() - _middle())) + np.sum(
-        (rest - foretold) ** 2, axis=-1
-    )
+    # With another gain on the whole, it would not be the light that leaves more or less.
+    gain = tiles.pool_gain(agrees, _around() - _middle()) * usual / tiles.usual
+    after = tiles.left(gain) + np.sum((rest - foretold) ** 2, axis=-1)
     return float(before[inner].sum()) / max(float(after[inner].sum()), 1e-30)
 
 

@@ -207,7 +207,7 @@ NOISE_PATCHES = TABLE.stated(
 # Light that is not that of the reference, in illumination.py and register.py
 
 LIGHT_EXCESS_MIN = TABLE.measured(
-    "LIGHT_EXCESS_MIN", 0.15, "of what the light that neighbours foretell leaves",
+    "LIGHT_EXCESS_MIN", 0.2, "of what the light that neighbours foretell leaves",
     "That one gain and one plane leave more. 1.5 times as large, it changes nothing in 26 cases; as small, 1 of 26 "
     "cases is decided otherwise and errors change by 0.5 %.",
     command=BODIES_TRIED,
@@ -240,6 +240,11 @@ LIGHT_GAIN_RATIO_MAX = TABLE.measured(
 RICH_SIGMAS = TABLE.derived(
     "RICH_SIGMAS", 13.5, "sigma",
     "Of the noise by which a tile stands out that tells a gain: chosen by its own noise, it is 7 % off at most.",
+)
+STRUCTURE_MIN = TABLE.derived(
+    "STRUCTURE_MIN", 2.0, "of the variance of the noise",
+    "Of structure beside planes over tiles, to tell a gain: the noise is known to a tenth of it (NOISE_ERROR), or to a "
+    "fifth where it is not white, and so the gain to 5 or 10 %.",
 )
 LIGHT_GROUPS = TABLE.stated(
     "LIGHT_GROUPS", 5, "groups",
