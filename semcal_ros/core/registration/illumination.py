@@ -297,7 +297,6 @@ def _find_usual_gain(common: Array, structure: Array, by_noise: Array, chance: A
     ratios = ratios[ratios > GAIN_MIN]
     if len(ratios) >= TELLING_TILES_MIN:
         return median(ratios)
-    print("totals", np.sum(structure) / np.sum(by_noise))
     if np.sum(structure) < STRUCTURE_MIN * np.sum(by_noise):
         return 0.0
     return float(np.sum(common) / np.sum(structure))
