@@ -180,6 +180,18 @@ def test_where_light_and_specimen_are_alike_the_shift_is_as_uncertain_as_light_m
     assert np.max(sigma) > 3.0 * np.max(np.sqrt(np.diag(plain.covariance)))
 
 
+def test_a_shift_that_another_light_moves_far_is_refused() -> None:
+    truth = _texture(np.random.default_rng(8))
+    found = register(prepare_reference(truth), truth, guess_covariance=np.eye(2))
+    near, far = (registering._allow_for_light(found, np.array([x, 0.5])) for x in (1.5, 2.5))
+    assert near.accepted
+    assert near.covariance - found.covariance == pytest.approx(
+        np.array([[2.25, 0.75], [0.75, 0.25]])
+    )
+    assert not far.accepted
+    assert "if its light has changed, the shift is another one by 2.5 px" in far.reason
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["soft shadow over holes", "soft shadow over fibres"])
 def test_a_scene_under_a_soft_shadow_is_followed(name: str) -> None:
