@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -178,6 +181,26 @@ def test_where_light_and_specimen_are_alike_the_shift_is_as_uncertain_as_light_m
     sigma = np.sqrt(np.diag(lit.covariance))
     assert np.all(np.abs(lit.shift_px) < 3.0 * sigma)
     assert np.max(sigma) > 3.0 * np.max(np.sqrt(np.diag(plain.covariance)))
+
+
+def test_light_that_may_be_something_else_only_widens_the_sigma(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(9)
+    truth = _texture(rng, 3.0)
+    reference = prepare_reference(_with_noise(truth, rng))
+    image = _with_noise(_shadow(0.6, 12.0) * truth, rng)
+
+    def unsure(*args: Any) -> Illumination | None:
+        light = measure_illumination(*args)
+        return None if light is None else replace(light, is_sure=False)
+
+    monkeypatch.setattr(registering, "measure_illumination", unsure)
+    doubted = register(reference, image, guess_covariance=np.eye(2))
+    monkeypatch.setattr(registering, "measure_illumination", lambda *_: None)
+    plain = register(reference, image, guess_covariance=np.eye(2))
+    assert doubted.shift_px == pytest.approx(plain.shift_px, abs=1e-9)
+    assert doubted.covariance[0, 0] > plain.covariance[0, 0] + 1e-6
 
 
 def test_a_shift_that_another_light_moves_far_is_refused() -> None:
