@@ -75,7 +75,7 @@ class Illumination:
     gain
         (rows, cols) contrast of the image over that of the reference, about that of most tiles.
     offset
-        (rows, cols) brightness that the gain of the whole image leaves, about the mean of the image.
+        (rows, cols) brightness that the gain of each tile leaves, about the mean of the image.
     corner_px, side_px
         (2,) left and top of the first tile in the image, and width and height of a tile.
     kept
@@ -413,15 +413,13 @@ def _is_seen_everywhere(tiles: _Tiles, agrees: Mask, offset: Array) -> bool:
 
     ``offset`` (rows, cols) is the brightness that the usual gain leaves.
     """
-    common, structure, scatter2 = (
-        np.array(
-            [float(part.sum()) for part in np.array_split(values[agrees][order], LIGHT_GROUPS)]
-        )
-        for order in [np.argsort(offset[agrees])]
-        for values in (tiles.common, tiles.structure, tiles.scatter2)
-    )
-    surely = np.maximum(tiles.least * structure, COVERED_SIGMAS * np.sqrt(scatter2))
-    return bool(np.all(common > surely))
+    values = np.stack([tiles.common, tiles.structure, tiles.scatter2])[:, agrees]
+    by_brightness = values[:, np.argsort(offset[agrees])]
+    for group in np.array_split(by_brightness, LIGHT_GROUPS, axis=1):
+        common, structure, scatter2 = group.sum(axis=1)
+        if common <= max(tiles.least * structure, COVERED_SIGMAS * np.sqrt(scatter2)):
+            return False
+    return True
 
 
 def _around() -> Array:

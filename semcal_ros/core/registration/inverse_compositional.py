@@ -197,15 +197,17 @@ class Alignment:
         pull, sure = self._comparison.level.factor * _find_pulls(self._comparison, self._left)
         if not np.any(pull):
             return self
-        joint = self.joint_covariance.copy()
-        joint[:2, :2] += np.outer(pull, pull)
         return replace(
-            self,
-            covariance=self.covariance + np.outer(pull, pull),
-            joint_covariance=joint,
+            self.widened(np.outer(pull, pull)),
             pull_px=pull,
             may_be_pulled=bool(np.any(sure**2 > np.diag(self.covariance))),
         )
+
+    def widened(self, covariance: Array) -> Alignment:
+        """The same with a shift that is less certain by a covariance (2, 2)."""
+        joint = self.joint_covariance.copy()
+        joint[:2, :2] += covariance
+        return replace(self, covariance=self.covariance + covariance, joint_covariance=joint)
 
     def fit_similarity(self) -> SimilarityFit | None:
         """Estimate a rotation and a scale, too; None where too few tiles are compared."""

@@ -175,14 +175,7 @@ class Registration:
 
     def widened(self, covariance: Array) -> Registration:
         """The same with a shift that is less certain by a covariance (2, 2)."""
-        joint = self.alignment.joint_covariance.copy()
-        joint[:2, :2] += covariance
-        alignment = replace(
-            self.alignment,
-            covariance=self.alignment.covariance + covariance,
-            joint_covariance=joint,
-        )
-        return replace(self, alignment=alignment)
+        return replace(self, alignment=self.alignment.widened(covariance))
 
     @property
     def accepted(self) -> bool:
