@@ -38,6 +38,7 @@ from semcal_ros.core.calibration.estimator.blocks import (
 )
 from semcal_ros.core.calibration.estimator.normal_equations import (
     Eliminated,
+    Inner,
     NormalEquations,
     damped_diagonal,
     normal_equations,
@@ -413,10 +414,10 @@ def _mean_drift_variance(problem: Problem, reduced: Eliminated, views: Array) ->
     visit, own = problem.effects.visit, problem.layout.of_view["view.drift"]
     outer = problem.layout.view.start
     count = np.bincount(visit)
-    by_rest = sum_by(visit, len(count), reduced.pose_by_rest[:, own]) / count[:, None, None]
+    by_rest = sum_by(visit, len(count), reduced.views.by_rest[:, own]) / count[:, None, None]
     # The views of a visit have the same covariance of what they share.
     shared = views[np.unique(visit, return_index=True)[1], :outer, :outer]
-    single = np.diagonal(reduced.pose_inverse[:, own, own], axis1=1, axis2=2)
+    single = np.diagonal(reduced.views.inverse[:, own, own], axis1=1, axis2=2)
     return np.asarray(
         np.einsum("jap,jpq,jaq->ja", by_rest, shared, by_rest, optimize=True)
         + sum_by(visit, len(count), single) / count[:, None] ** 2
@@ -433,20 +434,18 @@ def _posterior(problem: Problem, reduced: Eliminated, covariance: Array) -> tupl
         outer = spread[problem.group]
         variance = np.zeros((0, 0))
     else:
-        by_visit = _with_inner(
-            spread[problem.effects.visit_group], reduced.visit_by_rest, reduced.visit_inverse
-        )
+        by_visit = _with_inner(spread[problem.effects.visit_group], reduced.visits)
         own = problem.layout.visit
         variance = np.diagonal(by_visit[:, own, own], axis1=1, axis2=2)
         outer = by_visit[problem.effects.visit]
-    return variance, _with_inner(outer, reduced.pose_by_rest, reduced.pose_inverse)
+    return variance, _with_inner(outer, reduced.views)
 
 
-def _with_inner(outer: Array, by_outer: Array, inverse: Array) -> Array:
+def _with_inner(outer: Array, inner: Inner) -> Array:
     """Return the joint covariances of outer unknowns and of inner ones that were eliminated."""
-    cross = -outer @ np.swapaxes(by_outer, 1, 2)
-    inner = inverse - by_outer @ cross
-    return np.block([[outer, cross], [np.swapaxes(cross, 1, 2), inner]])
+    cross = -outer @ np.swapaxes(inner.by_rest, 1, 2)
+    own = inner.inverse - inner.by_rest @ cross
+    return np.block([[outer, cross], [np.swapaxes(cross, 1, 2), own]])
 
 
 def _make_singular_result(

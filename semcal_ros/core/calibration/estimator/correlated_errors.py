@@ -175,9 +175,9 @@ def jitter_covariance(problem: Problem, result: BundleResult, jitter: LineJitter
         score = np.zeros((problem.layout.size, rows.shape[2]))
         score[columns] = rows[0] * xx + rows[1] * yx
         # What a shift of each corner along x does to the theta of the optimum.
-        outer = score[:inner] - reduced.pose_by_rest[v].T @ score[inner:]
+        outer = score[:inner] - reduced.views.by_rest[v].T @ score[inner:]
         if problem.effects is not None:
-            own = reduced.visit_by_rest[problem.effects.visit[v]]
+            own = reduced.visits.by_rest[problem.effects.visit[v]]
             first = problem.layout.visit.start
             outer = outer[:first] - own.T @ outer[first:]
         pull = problem.designs[problem.group[v]].T @ outer

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array, Indices, invert_scaled
+from semcal_ros.core.arrays import Array, Indices
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
@@ -77,6 +77,17 @@ def normal_equations(
 
 
 @dataclass(frozen=True)
+class Inner:
+    """Unknowns that were eliminated: their steps are ``step - by_rest @ rest``, (n, p) and (n, p, q), and the inverse
+    of their own equations is (n, p, p).
+    """
+
+    by_rest: Array
+    step: Array
+    inverse: Array
+
+
+@dataclass(frozen=True)
 class Eliminated:
     """Normal equations without the unknowns of views (here: poses) and visits, and the way back to these.
 
@@ -84,36 +95,29 @@ class Eliminated:
     ----------
     information, gradient
         (M, C, C) and (M, C) of each magnification.
-    pose_by_rest, pose
-        (V, p, C + w) and (V, p): a view's step is ``pose - pose_by_rest @ rest``, where ``rest`` is
-        the step of its magnification and of its visit.
-    visit_by_rest, visit
-        (J, w, C) and (J, w), the same for visits.
-    pose_inverse, visit_inverse
-        (V, p, p) and (J, w, w): inverse of what was eliminated.
+    views
+        V blocks of p unknowns; their rest are the C + w unknowns of the magnification and of the visit.
+    visits
+        J blocks of w unknowns; their rest are the C unknowns of the magnification.
     """
 
     information: Array
     gradient: Array
-    pose_by_rest: Array
-    pose: Array
-    visit_by_rest: Array
-    visit: Array
-    pose_inverse: Array
-    visit_inverse: Array
+    views: Inner
+    visits: Inner
 
     def back(self, problem: Problem, change: Array) -> tuple[Array, Array, Array]:
         """Return the steps of views' magnifications (V, C), visits (J, w) and poses (V, p)."""
         by_group = problem.designs @ change
         rest = by_group[problem.group]
-        visits = self.visit
+        visits = self.visits.step
         if problem.effects is not None:
             own = by_group[problem.effects.visit_group]
-            visits = visits - np.einsum("jwc,jc->jw", self.visit_by_rest, own)
+            visits = visits - np.einsum("jwc,jc->jw", self.visits.by_rest, own)
             both = np.concatenate([rest, visits[problem.effects.visit]], axis=1)
         else:
             both = rest
-        return rest, visits, self.pose - np.einsum("vpq,vq->vp", self.pose_by_rest, both)
+        return rest, visits, self.views.step - np.einsum("vpq,vq->vp", self.views.by_rest, both)
 
 
 def schur_complement(
@@ -121,18 +125,10 @@ def schur_complement(
 ) -> Eliminated:
     """Eliminate the poses, then the visits."""
     first, outer = problem.layout.visit.start, problem.layout.view.start
-    pose_inverse = _damped_inverse(normal.matrix[:, outer:, outer:], damping)
-    right = np.concatenate(
-        [normal.matrix[:, outer:, :outer], normal.right[:, outer:, None]], axis=2
-    )
-    solved = pose_inverse @ right
-    cross = normal.matrix[:, :outer, outer:]
-    own = normal.matrix[:, :outer, :outer] - cross @ solved[:, :, :outer]
-    gradient = normal.right[:, :outer] - (cross @ solved[:, :, outer:])[:, :, 0]
+    own, gradient, views = eliminate(normal.matrix, normal.right, outer, damping)
     groups = len(problem.designs)
     if problem.effects is None:
-        empty = np.zeros((0, 0, first)), np.zeros((0, 0)), np.zeros((0, 0, 0))
-        visit_by_rest, visit, visit_inverse = empty
+        visits = Inner(np.zeros((0, 0, first)), np.zeros((0, 0)), np.zeros((0, 0, 0)))
         group = problem.group
     else:
         group = problem.effects.visit_group
@@ -142,29 +138,60 @@ def schur_complement(
         visit_columns = np.arange(first, outer)
         own[:, visit_columns, visit_columns] += sigma**-2.0
         gradient[:, first:] -= state.visits / sigma**2
-        visit_inverse = _damped_inverse(own[:, first:, first:], damping)
-        visit_by_rest = visit_inverse @ own[:, first:, :first]
-        visit = (visit_inverse @ gradient[:, first:, None])[:, :, 0]
-        across = own[:, :first, first:]
-        gradient = gradient[:, :first] - (across @ visit[:, :, None])[:, :, 0]
-        own = own[:, :first, :first] - across @ visit_by_rest
+        own, gradient, visits = eliminate(own, gradient, first, damping)
     return Eliminated(
         information=sum_by(group, groups, own),
         gradient=sum_by(group, groups, gradient),
-        pose_by_rest=solved[:, :, :outer],
-        pose=solved[:, :, outer],
-        visit_by_rest=visit_by_rest,
-        visit=visit,
-        pose_inverse=pose_inverse,
-        visit_inverse=visit_inverse,
+        views=views,
+        visits=visits,
     )
 
 
-def _damped_inverse(matrix: Array, damping: float) -> Array:
-    diagonal = np.arange(matrix.shape[-1])
-    out = matrix.copy()
-    out[:, diagonal, diagonal] = damped_diagonal(matrix, damping)
-    return invert_scaled(out)
+def eliminate(
+    matrix: Array, right: Array, first: int, damping: float = 0.0
+) -> tuple[Array, Array, Inner]:
+    """Eliminate the unknowns from ``first`` on.
+
+    Parameters
+    ----------
+    matrix, right
+        (n, q + p, q + p) and (n, q + p) normal equations, where ``first`` is q.
+    damping
+        Marquardt's damping of what is eliminated.
+
+    Returns
+    -------
+    The equations of the others, (n, q, q) and (n, q), and what was eliminated.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If what is eliminated is not positive definite.
+
+    Notes
+    -----
+    An inverse makes what is left wrong by the rounding times the condition of what is eliminated, a Cholesky factor by
+    the rounding times the root of it (Higham, Accuracy and Stability of Numerical Algorithms,
+    doi:10.1137/1.9780898718027, section 10.1). The difference counts where the pose of a view takes nearly all that is
+    known of a pivot or a grid: what an inverse leaves of it is not positive, and a choice among terms has no minimum.
+    """
+    inner = matrix[:, first:, first:].copy()
+    diagonal = np.arange(inner.shape[-1])
+    inner[:, diagonal, diagonal] = damped_diagonal(inner, damping)
+    # By powers of two, which do not round.
+    scale = np.exp2(-np.round(0.5 * np.log2(inner[:, diagonal, diagonal])))
+    factor = np.linalg.cholesky(inner * (scale[:, :, None] * scale[:, None, :]))
+    root = np.linalg.inv(factor) * scale[:, None, :]
+    transposed = np.swapaxes(root, 1, 2)
+    both = np.concatenate([matrix[:, :, :first], right[:, :, None]], axis=2)
+    half = root @ both[:, first:]
+    left = both[:, :first] - np.swapaxes(half[:, :, :first], 1, 2) @ half
+    solved = transposed @ half
+    return (
+        left[:, :, :first],
+        left[:, :, first],
+        Inner(solved[:, :, :first], solved[:, :, first], transposed @ root),
+    )
 
 
 def damped_diagonal(matrix: Array, damping: Array | float) -> Array:
