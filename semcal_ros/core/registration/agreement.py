@@ -57,7 +57,7 @@ from semcal_ros.core.registration.thresholds import (
     TELLING_TILES_MIN,
     TILE_SHIFT_PX_MAX,
 )
-from semcal_ros.core.registration.tiles import band_of
+from semcal_ros.core.registration.tiles import PyramidLevel, band_of
 
 
 @dataclass(frozen=True)
@@ -143,13 +143,13 @@ class Agreement:
         return bool(areas[areas >= BODY_TILES_MIN].sum() > 0.6 * tiles)
 
 
-def information_weights(gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise) -> Array:
-    """(rows, cols) 0 to 1: what of the gradients of tiles (rows, cols, 2, 2) of so many ``pixels`` (rows, cols) is
-    structure and not noise.
+def information_weights(level: PyramidLevel, noise: TileNoise) -> Array:
+    """(rows, cols) 0 to 1: what of the gradients of the tiles of a reference is structure and not noise.
 
     A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
     """
-    return _spread(_share_of_structure(gradient, pixels, sigma_px, noise))
+    gradient, shows = level.normal_matrices[..., :2, :2], level.shows_structure
+    return _spread(_share_of_structure(gradient, level.pixel_counts, level.sigma_px, noise, shows))
 
 
 def _spread(own: Array) -> Array:
@@ -157,13 +157,21 @@ def _spread(own: Array) -> Array:
     return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
 
 
-def _share_of_structure(gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise) -> Array:
-    """(rows, cols) 0 to 1: what of the gradients of each tile for itself is structure."""
+def _share_of_structure(
+    gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise, shows: Mask | None
+) -> Array:
+    """(rows, cols) 0 to 1: what of the gradients of each tile for itself is structure; 0 where it neither ``shows`` any
+    nor has more of a gradient than noise.
+    """
     energy = gradient[..., 0, 0] + gradient[..., 1, 1]
     expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
     # Smoothed noise has fewer independent pixels.
     scatter = expected * np.sqrt(shared_pixels(sigma_px) / pixels)
-    signal = np.where(energy - expected > AGREEMENT_SIGMAS * scatter, energy - expected, 0.0)
+    excess = energy - expected
+    is_structure = excess > AGREEMENT_SIGMAS * scatter
+    if shows is not None:
+        is_structure = is_structure | shows
+    signal = np.where(is_structure, np.maximum(excess, 0.0), 0.0)
     return np.asarray(signal / np.maximum(signal + expected, 1e-30))
 
 
@@ -183,7 +191,8 @@ def find_agreement(
     shift before, if those are looked for.
     """
     shared, count = shared_pixels(tiles.sigma_px), tiles.pixels
-    own = _share_of_structure(tiles.gradient, count, tiles.sigma_px, noise)
+    shows = tiles.shows_structure
+    own = _share_of_structure(tiles.gradient, count, tiles.sigma_px, noise, shows)
     weights = _spread(own)
     gain = _bound_gain(tiles, noise, weights)
     raw = tiles.image - 2.0 * gain * tiles.common + gain**2 * tiles.reference

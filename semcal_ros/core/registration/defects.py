@@ -376,8 +376,7 @@ def _refine(
 def _weigh_tiles(shown: _Shown, shift: Array, noise: TileNoise) -> Array:
     """(rows, cols) information of the tiles that show the lattice."""
     level = shown.level
-    gradient = level.normal_matrices[..., :2, :2]
-    weights = information_weights(gradient, level.pixel_counts, level.sigma_px, noise)
+    weights = information_weights(level, noise)
     return np.where(shown.at(shift), weights, 0.0)
 
 

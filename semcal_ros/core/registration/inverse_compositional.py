@@ -43,7 +43,7 @@ import cv2
 import numpy as np
 from scipy.special import stdtrit
 
-from semcal_ros.core.arrays import Array, equilibrate, median
+from semcal_ros.core.arrays import Array, Mask, equilibrate, median
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.noise_spectrum import shared_pixels
@@ -255,6 +255,8 @@ class TileStatistics:
         (rows, cols) image grey levels per reference grey level.
     gradient
         (rows, cols, 2, 2) sums of products of the reference's gradients.
+    shows_structure
+        (rows, cols) tiles where the reference shows structure, whatever its gradients; None where only these tell.
     scores
         (rows, cols, 2) products of the gradient with what gain and offset leave.
     """
@@ -268,6 +270,7 @@ class TileStatistics:
     common: Array
     gain: Array
     gradient: Array
+    shows_structure: Mask | None
     scores: Array
 
 
@@ -276,6 +279,7 @@ def _make_statistics(
 ) -> TileStatistics:
     own, cross = level.normal_matrices[window.rows, window.cols], sums.cross
     pixels, shape = level.pixel_counts[window.rows, window.cols], own.shape[:2]
+    shows = level.shows_structure
     gain = gain.reshape(shape)
     # The offset of each tile is its own: charging and shading say nothing of the shift.
     offset = (cross[..., 3] - gain * own[..., 2, 3]) / pixels
@@ -292,6 +296,7 @@ def _make_statistics(
         cross[..., 2] - own[..., 2, 3] * cross[..., 3] / pixels,
         gain,
         own[..., :2, :2],
+        shows if shows is None else shows[window.rows, window.cols],
         residual,
     )
 

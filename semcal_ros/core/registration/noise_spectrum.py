@@ -28,9 +28,11 @@ of the spectrum allows is what divides.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -44,6 +46,7 @@ from semcal_ros.core.registration.thresholds import (
     NOISE_SPECTRUM_PX,
     RICH_PART_PX,
     RICH_PARTS,
+    RICH_VARIANCE_MAX,
     SIGNAL_SIGMAS,
     SMOOTHING_FREQUENCIES,
     SMOOTHING_SIGMAS,
@@ -110,7 +113,11 @@ def _cut_middle(image: AnyImage, crop_px: int) -> Array:
     return image[top : top + rows, left : left + cols].astype(np.float64)
 
 
-def _radial_spectrum(image: AnyImage, crop_px: int) -> tuple[Array, Array, Array]:
+# Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring.
+_Spectrum: TypeAlias = tuple[Array, Array, Array]
+
+
+def _radial_spectrum(image: AnyImage, crop_px: int) -> _Spectrum:
     """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
     crop = _cut_middle(image, crop_px)
     window, ring, middle, count = _rings(*crop.shape)
@@ -141,7 +148,10 @@ def estimate_noise_variance(image: AnyImage) -> float:
 def measure_richest_parts(
     image: AnyImage, averaged: float = 1.0, raw: AnyImage | None = None
 ) -> ImageStatistics:
-    """The same as :func:`measure_image` of those parts of a sparse image that show most, put side by side."""
+    """The same as :func:`measure_image` of those parts of a sparse image that show most, by their mean spectrum.
+
+    The smoothing is the strongest of those nearly as good as the best: tiles show more of themselves.
+    """
     height, width = image.shape
     steps = [np.arange(0, n - RICH_PART_PX + 1, RICH_PART_PX // 2) for n in (height, width)]
     places = [(int(y), int(x)) for y in steps[0] for x in steps[1]]
@@ -155,11 +165,12 @@ def measure_richest_parts(
         if len(chosen) == RICH_PARTS:
             break
     parts = [np.s_[y : y + RICH_PART_PX, x : x + RICH_PART_PX] for y, x in chosen]
-    found = [
-        measure_image(image[part], averaged, None if raw is None else raw[part]) for part in parts
-    ]
-    # One of them may show something else.
-    return ImageStatistics(*np.median([astuple(part) for part in found], axis=0).tolist())
+
+    def spectrum(whole: AnyImage) -> _Spectrum:
+        return _mean_spectrum([_radial_spectrum(whole[part], RICH_PART_PX) for part in parts])
+
+    before = None if raw is None else spectrum(raw)
+    return _judge_spectrum(spectrum(image), averaged, before, RICH_VARIANCE_MAX)
 
 
 def measure_image(
@@ -186,7 +197,24 @@ def measure_image(
     The noise is read from the corners of the spectrum beyond 0.45 cycles per px; an image with
     texture up to there is taken for a noisier one, which costs a little precision and no bias.
     """
-    w, power, count = _radial_spectrum(image, side_px)
+    before = None if raw is None else _radial_spectrum(raw, side_px)
+    return _judge_spectrum(_radial_spectrum(image, side_px), averaged, before)
+
+
+def _mean_spectrum(spectra: Sequence[_Spectrum]) -> _Spectrum:
+    """Return the spectrum of several parts of one size."""
+    w, _, count = spectra[0]
+    return w, np.mean([power for _, power, _ in spectra], axis=0), len(spectra) * count
+
+
+def _judge_spectrum(
+    spectrum: _Spectrum, averaged: float, raw: _Spectrum | None, variance_max: float = 1.0
+) -> ImageStatistics:
+    """Return what :func:`measure_image` does, from the spectra of the image and of the one before it was resampled.
+
+    ``variance_max`` is by what a stronger smoothing than the best may raise the variance of a shift.
+    """
+    w, power, count = spectrum
     noise = white = _noise_floor(w, power, count)
     corners = float(np.sum(count[w > NOISE_BAND * np.pi]))
     # The error of the noise is common to all rings.
@@ -194,7 +222,7 @@ def measure_image(
     if averaged > 1.0:
         error2 += NOISE_ERROR**2
     if raw is not None:
-        white = max(noise, _noise_floor(*_radial_spectrum(raw, side_px)) / averaged)
+        white = max(noise, _noise_floor(*raw) / averaged)
     signal_variance = float(np.sum(_find_signal(power, white, count) * count) / np.sum(count))
     if white <= 0.0:
         return ImageStatistics(noise, signal_variance, float("inf"), 0.0, float("inf"))
@@ -218,7 +246,7 @@ def measure_image(
     single = white * averaged
     noisy = (white + single) * np.maximum(signal, 0.0) + white * single
     variances = (psi**2 @ (steep * noisy))[is_known] / least[is_known] ** 2
-    best = SMOOTHINGS_PX[is_known][int(np.argmin(variances))]
+    best = SMOOTHINGS_PX[is_known][variances <= variance_max * np.min(variances)][-1]
     return ImageStatistics(noise, signal_variance, ratio, float(best), significance)
 
 

@@ -97,7 +97,7 @@ from semcal_ros.core.registration.thresholds import (
     TEXTURE_PX_MIN,
     WEAK_SIGNAL_MIN,
 )
-from semcal_ros.core.registration.tiles import Pyramid, make_level
+from semcal_ros.core.registration.tiles import Pyramid, find_structure, make_level
 
 # How an image appears that fits part by part, but not by one shift. (That its halves disagree says it already.)
 _SIGNS_OF_DEFORMATION = frozenset(
@@ -307,7 +307,9 @@ def prepare_reference(
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
         if level is not None:
             noise = statistics.noise_variance / factor**2 * passed_variance(level.sigma_px)
-            levels.append(replace(level, noise_variance=noise))
+            level = replace(level, noise_variance=noise)
+            shows = find_structure(level) if is_sparse else None
+            levels.append(replace(level, shows_structure=shows))
     if not levels:
         defect = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     left, top, right, bottom = inside

@@ -148,12 +148,7 @@ def keep_specimen(
     where something moved otherwise in the image before, and ``stretch_px`` by how much another scale may move edges.
     """
     level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
-    first = information_weights(
-        level.normal_matrices[..., :2, :2],
-        level.pixel_counts,
-        level.sigma_px,
-        noise,
-    )
+    first = information_weights(level, noise)
     starts = [peak, *(p for p in peaks[:HYPOTHESES_MAX] if p is not peak)]
     sigma = np.inf if spread is None else float(np.sqrt(np.max(np.linalg.eigvalsh(spread))))
     if sigma < PREDICTED_PX_MAX:

@@ -24,11 +24,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from statistics import NormalDist
 from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Indices, Mask
 from semcal_ros.core.caches import LruCache
@@ -40,13 +42,21 @@ from semcal_ros.core.registration.fractional_delay import (
     gradients_transposed,
     sample_tiles,
 )
-from semcal_ros.core.registration.noise_spectrum import gaussian_taps, passed_variance, smooth
+from semcal_ros.core.registration.noise_spectrum import (
+    gaussian_taps,
+    passed_gradient,
+    passed_variance,
+    shared_pixels,
+    smooth,
+)
 from semcal_ros.core.registration.thresholds import (
+    AGREEMENT_SIGMAS,
     ALL_PIXELS,
     CURVATURES_KEPT,
     HESSIAN_BANDS,
     HESSIAN_PIXELS,
     SHARP_PX,
+    SHOWS_SMOOTHING_PX,
     TILES_MIN,
     WINDOWS_KEPT,
 )
@@ -78,6 +88,9 @@ class PyramidLevel:
         over each tile.
     noise_variance
         Of the smoothed pixels, in squared grey levels.
+    shows_structure
+        (rows, cols) tiles that show structure, whatever their gradients (:func:`find_structure`); None where only these
+        tell.
     dropped
         (rows, cols, n) True at pixels that do not count (:func:`drop_pixels`); None where all do.
     """
@@ -91,6 +104,7 @@ class PyramidLevel:
     products: Image
     normal_matrices: Array
     noise_variance: float = 0.0
+    shows_structure: Mask | None = None
     dropped: Mask | None = None
     #: The level of which they were dropped.
     undropped: PyramidLevel | None = field(default=None, repr=False, compare=False)
@@ -288,6 +302,28 @@ def make_level(pyramid: Pyramid, factor: int, sigma_px: float) -> PyramidLevel |
         products,
         normal_matrices,
     )
+
+
+def find_structure(level: PyramidLevel) -> Mask:
+    """Return which tiles (rows, cols) of a sparse picture show more than noise.
+
+    They are looked at under a stronger smoothing than a shift is measured with: that is best for edges, which are
+    sharp, and leaves so much noise that bodies which are plain to see do not stand out by their gradients.
+    """
+    rows, cols = level.products.shape[:2]
+    side_x, side_y = level.side
+    grey = level.products[:, :, 2].reshape(rows, cols, side_y, side_x).transpose(0, 2, 1, 3)
+    whole = np.ascontiguousarray(grey.reshape(rows * side_y, cols * side_x))
+    by_y, by_x = np.gradient(smooth(whole, SHOWS_SMOOTHING_PX))
+    energy = (by_x**2 + by_y**2).reshape(rows, side_y, cols, side_x).sum(axis=(1, 3))
+    sigma_px = float(np.hypot(level.sigma_px, SHOWS_SMOOTHING_PX))
+    pixels = side_x * side_y
+    noise = level.noise_variance / passed_variance(level.sigma_px)
+    expected = 2.0 * pixels * noise * passed_gradient(sigma_px)
+    # As rare as other deviations of tiles.
+    freedom = 2.0 * pixels / shared_pixels(sigma_px)
+    limit = float(chdtri(freedom, NormalDist().cdf(-AGREEMENT_SIGMAS))) / freedom
+    return np.asarray(energy > limit * expected)
 
 
 def drop_pixels(level: PyramidLevel, dropped: Mask) -> PyramidLevel:
