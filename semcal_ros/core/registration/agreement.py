@@ -207,7 +207,8 @@ def find_agreement(
     # Scatter of sums of products of smoothed noise.
     scatter = np.sqrt(shared * (count * floor**2 + 2.0 * structure * floor))
     missing = structure - gain * tiles.common
-    lacks = missing > MISSING_MAX * structure + AGREEMENT_SIGMAS * scatter
+    lack = missing - MISSING_MAX * structure
+    lacks = lack > AGREEMENT_SIGMAS * scatter
     left = raw - count * floor
     # Where it is bright, electrons scatter more than where the noise was measured: twice as much is nothing.
     exceeds = (
@@ -219,7 +220,15 @@ def find_agreement(
         tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
     )
     found = _find_odd(
-        tiles, own, disagrees, suspected, louder, shared, odd, looks_for_odd=looks_for_odd
+        tiles,
+        own,
+        disagrees,
+        suspected,
+        louder,
+        shared,
+        odd,
+        (lack, scatter),
+        looks_for_odd=looks_for_odd,
     )
     disagrees = disagrees | found.tiles
     # By area: a bright tool has more of a gradient than all of the ground.
@@ -240,11 +249,14 @@ def _find_odd(
     noise: TileNoise,
     shared: float,
     before: Mask | None,
+    lack: tuple[Array, Array],
     *,
     looks_for_odd: bool,
 ) -> OddBodies:
     """The bodies that move otherwise than all others, of those whose gradients have a share ``own`` (rows, cols) of
     structure and which do not disagree already.
+
+    ``lack`` (rows, cols) is by how much tiles miss more of their structure than they may, and its sigma.
     """
     structure, gain = own > 0.0, np.maximum(tiles.gain, 1e-6)
     informs, lost = structure & ~disagrees, structure & disagrees
@@ -263,6 +275,7 @@ def _find_odd(
         variances,
         before,
         lost=lost,
+        lack=lack,
         looks_for_odd=looks_for_odd,
     )
 

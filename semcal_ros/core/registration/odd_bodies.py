@@ -22,7 +22,8 @@ all others by more than those do among themselves.
 
 It fails where less than five bodies lie apart from each other, as on a continuous ground, and where as many move in one
 way as in the other. Where two bodies or more move otherwise than one that outweighs them, or are not seen where it is,
-it says that either may be the specimen, unless that one reaches from edge to edge.
+it says that either may be the specimen, unless that one reaches from edge to edge. Those that tell nothing by
+themselves are witnesses together.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from numpy.typing import NDArray
 
 from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.registration.thresholds import (
+    AGREEMENT_SIGMAS,
     ODD_BODIES_LEFT_MIN,
     ODD_BODIES_SPREAD_MIN,
     ODD_BODY_CHI2_MIN,
@@ -82,6 +84,17 @@ class _Bodies:
         kept = np.arange(len(self.numbers)) != index
         return _Bodies(self.shifts[kept], self.covariances[kept], self.numbers[kept], self.labels)
 
+    def beside(self, others: _Bodies) -> _Bodies:
+        """These and others, of other tiles."""
+        numbers = others.numbers + int(np.max(self.labels))
+        labels = np.where(others.labels > 0, others.labels + int(np.max(self.labels)), self.labels)
+        return _Bodies(
+            np.concatenate([self.shifts, others.shifts]),
+            np.concatenate([self.covariances, others.covariances]),
+            np.concatenate([self.numbers, numbers]),
+            labels,
+        )
+
     @property
     def precisions(self) -> Array:
         """(n,) how well the shift of each is known, 1 / px^2."""
@@ -102,6 +115,7 @@ def find_odd_bodies(
     before: Mask | None = None,
     *,
     lost: Mask | None = None,
+    lack: tuple[Array, Array] | None = None,
     looks_for_odd: bool = True,
 ) -> OddBodies:
     """Find the bodies of tiles that move otherwise than all others.
@@ -121,6 +135,9 @@ def find_odd_bodies(
     lost
         (rows, cols) True in tiles with structure that the image does not show at this shift; they do not inform.
         ``information`` and ``variances`` are what they would have; none by default.
+    lack
+        (rows, cols) by how much tiles miss more of their structure than they may, and its sigma: of bodies that tell
+        nothing by themselves, together they do. None where nothing is known of it.
     looks_for_odd
         Whether any is to be found; if not, it is said whether there is doubt, alone.
 
@@ -156,12 +173,18 @@ def find_odd_bodies(
     if lost is not None and np.any(lost):
         missing = _count_lost(informs | lost, lost, np.trace(information, axis1=2, axis2=3))
     largest = _find_largest(bodies)
-    if largest is None or len(bodies.numbers) + missing < 2:
+    faint = informs & ~odd & ~np.isin(bodies.labels, bodies.numbers)
+    together, witnesses = _measure_together(faint, information, pulls, variances)
+    if witnesses and lack is not None:
+        missed, sigma = lack[0][faint], lack[1][faint]
+        if missed.sum() > AGREEMENT_SIGMAS * np.sqrt(np.sum(sigma**2)):
+            missing, witnesses, together = missing + witnesses, 0, together.without(0)
+    if largest is None or len(bodies.numbers) + missing + witnesses < 2:
         return OddBodies(odd, False, np.zeros_like(odd), np.full(2, np.nan))
     rest = bodies.without(largest)
     return OddBodies(
         odd,
-        _is_in_doubt(bodies, largest, missing),
+        _is_in_doubt(bodies.beside(together), largest, missing, witnesses),
         bodies.labels == bodies.numbers[largest],
         _mean_shift(rest)[0] if len(rest.numbers) else np.full(2, np.nan),
     )
@@ -187,19 +210,20 @@ def _find_largest(bodies: _Bodies) -> int | None:
     return None if _reaches_across(bodies.labels == bodies.numbers[index]) else index
 
 
-def _is_in_doubt(bodies: _Bodies, index: int, missing: int) -> bool:
+def _is_in_doubt(bodies: _Bodies, index: int, missing: int, faint: int) -> bool:
     """Whether the bodies beside that of an index move alike, but otherwise than it, or as many as they are,
     ``missing``, are not seen.
 
-    By as much as the drift may shear the image, and as tiles are off, they may differ.
+    The last of the bodies are as many as ``faint`` that tell a shift together, if there are any. By as much as the
+    drift may shear the image, and as tiles are off, they may differ.
     """
     rest = bodies.without(index)
-    others = len(rest.numbers)
+    others = len(rest.numbers) + max(faint - 1, 0)
     if missing >= max(WITNESSES_MIN, others):
         return True
     if not others or others + missing < WITNESSES_MIN:
         return False
-    if others > 1 and np.any(_compare_alike(rest) >= ODD_BODY_CHI2_MIN):
+    if len(rest.numbers) > 1 and np.any(_compare_alike(rest) >= ODD_BODY_CHI2_MIN):
         return False
     mean, of_mean = _mean_shift(rest)
     off = bodies.shifts[index] - mean
@@ -251,9 +275,31 @@ def _are_inside(bodies: _Bodies) -> bool:
     return not _lies_at_edge(np.isin(bodies.labels, bodies.numbers))
 
 
+def _measure_together(
+    faint: Mask, information: Array, pulls: Array, variances: Array
+) -> tuple[_Bodies, int]:
+    """The shift of all tiles ``faint`` as one body, and of how many it is; no body and 0 where they tell none."""
+    own = faint.astype(np.uint8)
+    found = _measure_labels(own.astype(np.int32), information, pulls, variances, np.inf)
+    count = cv2.connectedComponents(own, connectivity=8)[0] - 1
+    return found, count if len(found.numbers) else 0
+
+
 def _measure_bodies(informs: Mask, information: Array, pulls: Array, variances: Array) -> _Bodies:
     """The shifts of bodies that tell one in both directions."""
-    count, labels = cv2.connectedComponents(informs.astype(np.uint8), connectivity=8)
+    labels = cv2.connectedComponents(informs.astype(np.uint8), connectivity=8)[1]
+    return _measure_labels(labels.astype(np.int32), information, pulls, variances)
+
+
+def _measure_labels(
+    labels: NDArray[np.int32],
+    information: Array,
+    pulls: Array,
+    variances: Array,
+    sigma_px: float = TELLING_SIGMA_PX_MAX,
+) -> _Bodies:
+    """The same of bodies with labels (rows, cols) from 1 on, with a sigma of their shift below ``sigma_px``."""
+    count = int(np.max(labels)) + 1
 
     def sum_up(values: Array) -> Array:
         flat = values.reshape(labels.size, -1)
@@ -269,10 +315,8 @@ def _measure_bodies(informs: Mask, information: Array, pulls: Array, variances: 
     shifts = np.einsum("nij,nj->ni", inverse, right[solvable])
     covariances = inverse @ scatter[solvable] @ inverse
     largest = covariances[:, 0, 0] + covariances[:, 1, 1]
-    tells = (largest < TELLING_SIGMA_PX_MAX**2) & (largest > 0.0)
-    return _Bodies(
-        shifts[tells], covariances[tells], solvable[tells] + 1, np.asarray(labels, dtype=np.int32)
-    )
+    tells = (largest < sigma_px**2) & (largest > 0.0)
+    return _Bodies(shifts[tells], covariances[tells], solvable[tells] + 1, labels)
 
 
 def _compare_alike(bodies: _Bodies) -> Array:

@@ -152,6 +152,31 @@ def test_where_other_bodies_are_not_seen_the_largest_may_not_be_the_specimen(
         assert found.in_doubt is (in_doubt and count >= 2)
 
 
+def test_bodies_that_tell_nothing_by_themselves_are_witnesses_together() -> None:
+    """Each knows its shift to 0.8 px, more than counts for one; eight together know it to 0.3 px."""
+    rng, still = np.random.default_rng(11), np.zeros(2)
+
+    def doubts(shift: Array) -> int:
+        parts = [(TOOL, still, 0.05), *((_one(tile), shift, 0.8) for tile in PARTICLES)]
+        return sum(find_odd_bodies(*_scores(parts, rng)).in_doubt for _ in range(300))
+
+    # By chance one in 3000.
+    assert doubts(still) <= 2
+    # 6.7 sigmas, where four count: it is missed once in 300 times.
+    assert doubts(np.array([2.0, 1.0])) > 294
+
+
+def test_bodies_that_are_missed_together_are_as_good_as_seen_elsewhere() -> None:
+    rng, still = np.random.default_rng(12), np.zeros(2)
+    parts = [(TOOL, still, 0.05), *((_one(tile), still, 0.8) for tile in PARTICLES)]
+    sigma = np.ones((ROWS, COLS))
+    for missed, doubted in ((0.0, False), (1.0, False), (3.0, True)):
+        lack = np.full((ROWS, COLS), missed), sigma
+        found = find_odd_bodies(*_scores(parts, rng), lack=lack)
+        # Eight together know it to 0.35 of what one does: 4.5 sigmas of theirs are 1.6 of one.
+        assert found.in_doubt == doubted
+
+
 def test_bodies_inside_the_image_are_the_specimen_also_where_they_lie_together() -> None:
     rng, still, shift = np.random.default_rng(10), np.zeros(2), np.array([0.4, 0.0])
     together = [(8, 10), (8, 13), (11, 10), (11, 13), (13, 12)]
