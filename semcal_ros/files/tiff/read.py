@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import logging
 import struct
+import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -242,18 +243,37 @@ def is_tiff(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the TIFF parsers from logging unknown tags, and what is raised as an error here."""
-    logger = logging.getLogger("tifffile")
-    before, opencv = logger.disabled, _OPENCV_LOG.getLogLevel()
-    logger.disabled = True
-    _OPENCV_LOG.setLogLevel(0)  # LOG_LEVEL_SILENT
-    try:
-        yield
-    finally:
-        logger.disabled = before
-        _OPENCV_LOG.setLogLevel(opencv)
+class _Quiet:
+    """Keeps the TIFF parsers from logging unknown tags, and what is raised as an error here.
+
+    Their logs are those of the process: of threads that overlap, the first one turns them off, and the last one
+    restores what was there before the first.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._count = threading.Lock(), 0
+        self._before = False, 0
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        logger = logging.getLogger("tifffile")
+        with self._lock:
+            if self._count == 0:
+                self._before = logger.disabled, _OPENCV_LOG.getLogLevel()
+                logger.disabled = True
+                _OPENCV_LOG.setLogLevel(0)  # LOG_LEVEL_SILENT
+            self._count += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._count -= 1
+                if self._count == 0:
+                    logger.disabled, level = self._before
+                    _OPENCV_LOG.setLogLevel(level)
+
+
+_quiet = _Quiet()
 
 
 def _tag_settings(

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import logging
 import struct
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,12 @@ import pytest
 import tifffile
 
 from semcal_ros.core.errors import TiffError
-from semcal_ros.files.tiff.read import read_page_settings, read_sem_pages, read_sem_tiff
+from semcal_ros.files.tiff.read import (
+    open_tiff,
+    read_page_settings,
+    read_sem_pages,
+    read_sem_tiff,
+)
 from tests.helpers.sem_files import zeiss_text
 
 PIXELS = (np.arange(20 * 32) % 251).astype(np.uint8).reshape(20, 32)
@@ -150,6 +156,27 @@ def test_reading_page_by_page_leaves_the_loggers_alone(tmp_path: Path) -> None:
     next(pages)
     assert not logging.getLogger("tifffile").disabled
     pages.close()
+
+
+def test_threads_that_read_at_once_leave_the_loggers_alone(tmp_path: Path) -> None:
+    """The one that begins first ends first, while the parsers are still quiet for the other."""
+    path = write(tmp_path / "z.tif")
+    begun, other_begun, ended = (threading.Event() for _ in range(3))
+
+    def read_first() -> None:
+        with open_tiff(path):
+            begun.set()
+            other_begun.wait()
+        ended.set()
+
+    thread = threading.Thread(target=read_first)
+    thread.start()
+    begun.wait()
+    with open_tiff(path):
+        other_begun.set()
+        ended.wait()
+    thread.join()
+    assert not logging.getLogger("tifffile").disabled
 
 
 def test_a_page_that_is_not_there(tmp_path: Path) -> None:
