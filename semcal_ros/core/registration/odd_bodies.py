@@ -169,18 +169,21 @@ def find_odd_bodies(
             break
         odd |= body
         bodies = rest
+    nothing = OddBodies(odd, False, np.zeros_like(odd), np.full(2, np.nan))
+    largest = _find_largest(bodies)
+    if largest is None:
+        return nothing
     missing = 0
     if lost is not None and np.any(lost):
         missing = _count_lost(informs | lost, lost, np.trace(information, axis1=2, axis2=3))
-    largest = _find_largest(bodies)
     faint = informs & ~odd & ~np.isin(bodies.labels, bodies.numbers)
     together, witnesses = _measure_together(faint, information, pulls, variances)
     if witnesses and lack is not None:
         missed, sigma = lack[0][faint], lack[1][faint]
         if missed.sum() > AGREEMENT_SIGMAS * np.sqrt(np.sum(sigma**2)):
             missing, witnesses, together = missing + witnesses, 0, together.without(0)
-    if largest is None or len(bodies.numbers) + missing + witnesses < 2:
-        return OddBodies(odd, False, np.zeros_like(odd), np.full(2, np.nan))
+    if len(bodies.numbers) + missing + witnesses < 2:
+        return nothing
     rest = bodies.without(largest)
     return OddBodies(
         odd,
