@@ -118,7 +118,7 @@ _Spectrum: TypeAlias = tuple[Array, Array, Array]
 
 
 def _radial_spectrum(image: AnyImage, crop_px: int) -> _Spectrum:
-    """Radial frequency (rad/px), mean power per pixel and number of coefficients of each ring."""
+    """The spectrum of the middle of an image."""
     crop = _cut_middle(image, crop_px)
     window, ring, middle, count = _rings(*crop.shape)
     crop = (crop - float(np.sum(crop * window) / window.sum())) * window

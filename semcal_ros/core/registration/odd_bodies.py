@@ -86,12 +86,12 @@ class _Bodies:
 
     def beside(self, others: _Bodies) -> _Bodies:
         """These and others, of other tiles."""
-        numbers = others.numbers + int(np.max(self.labels))
-        labels = np.where(others.labels > 0, others.labels + int(np.max(self.labels)), self.labels)
+        most = int(np.max(self.labels))
+        labels = np.where(others.labels > 0, others.labels + most, self.labels)
         return _Bodies(
             np.concatenate([self.shifts, others.shifts]),
             np.concatenate([self.covariances, others.covariances]),
-            np.concatenate([self.numbers, numbers]),
+            np.concatenate([self.numbers, others.numbers + most]),
             labels,
         )
 
@@ -178,16 +178,17 @@ def find_odd_bodies(
         missing = _count_lost(informs | lost, lost, np.trace(information, axis1=2, axis2=3))
     faint = informs & ~odd & ~np.isin(bodies.labels, bodies.numbers)
     together, witnesses = _measure_together(faint, information, pulls, variances)
+    seen = bodies.beside(together)
     if witnesses and lack is not None:
         missed, sigma = lack[0][faint], lack[1][faint]
         if missed.sum() > AGREEMENT_SIGMAS * np.sqrt(np.sum(sigma**2)):
-            missing, witnesses, together = missing + witnesses, 0, together.without(0)
+            missing, witnesses, seen = missing + witnesses, 0, bodies
     if len(bodies.numbers) + missing + witnesses < 2:
         return nothing
     rest = bodies.without(largest)
     return OddBodies(
         odd,
-        _is_in_doubt(bodies.beside(together), largest, missing, witnesses),
+        _is_in_doubt(seen, largest, missing, witnesses),
         bodies.labels == bodies.numbers[largest],
         _mean_shift(rest)[0] if len(rest.numbers) else np.full(2, np.nan),
     )

@@ -307,9 +307,10 @@ def prepare_reference(
         level = make_level(pyramid, factor, statistics.sigma_px / factor)
         if level is not None:
             noise = statistics.noise_variance / factor**2 * passed_variance(level.sigma_px)
-            level = replace(level, noise_variance=noise)
-            shows = find_structure(level) if is_sparse else None
-            levels.append(replace(level, shows_structure=shows))
+            levels.append(replace(level, noise_variance=noise))
+    if is_sparse and levels:
+        # Tiles are judged at full resolution alone.
+        levels[-1] = replace(levels[-1], shows_structure=find_structure(levels[-1]))
     if not levels:
         defect = f"only {gray.shape[1]} x {gray.shape[0]} px to compare"
     left, top, right, bottom = inside
