@@ -530,15 +530,16 @@ def _add_field(
         if np.any(adjustment.result.lost):
             # A field that moves corners to where the camera shows nothing is none.
             return start, None, None
-        system = field_system(setup, adjustment.problem, adjustment.result, field)
-        if turn < CHOOSING_ROUNDS:
-            try:
+        try:
+            system = field_system(setup, adjustment.problem, adjustment.result, field)
+            if turn < CHOOSING_ROUNDS:
                 choice = choose_field(setup, system, blank)
-            except UnusableCalibrationError:
-                if always:
-                    raise
-                # What cannot be predicted from the rest does not show that there is a field.
-                return start, None, None
+        except UnusableCalibrationError:
+            if always:
+                raise
+            # What cannot be predicted from the rest does not show that there is a field.
+            return start, None, None
+        if turn < CHOOSING_ROUNDS:
             if not (choice.worthwhile or always):
                 return start, None, None
             if turn == 0 and setup.shared and not always:

@@ -28,14 +28,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate, invert_scaled
+from semcal_ros.core.arrays import Array, Indices, Mask, equilibrate
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     BundleResult,
     residual_variance,
     variance_factor,
 )
-from semcal_ros.core.calibration.estimator.normal_equations import sum_by
+from semcal_ros.core.calibration.estimator.normal_equations import eliminate, sum_by
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
@@ -54,6 +54,7 @@ from semcal_ros.core.calibration.estimator.thresholds import (
     OVERLAP_PX,
     REFERENCE_WIDTH_PX,
     RIDGES,
+    ROUNDING_DAMPING,
     SMOOTHNESS,
     STEADINESS,
     STRENGTHS_PX,
@@ -152,8 +153,12 @@ def _cholesky(scaled: Array) -> tuple[Array, bool]:
                 scaled + ridge * np.eye(len(scaled)), check_finite=False
             )
             return factor
-    raise UnusableCalibrationError(
-        "equations of the residual field that rounding has made unsolvable",
+    raise _rounded("the residual field")
+
+
+def _rounded(whose: str) -> UnusableCalibrationError:
+    return UnusableCalibrationError(
+        f"equations of {whose} that rounding has made unsolvable",
         expected="views that determine the camera",
         do="record more views, or calibrate with --residual off",
     )
@@ -297,24 +302,30 @@ def _without_poses_and_visits(
     The order is camera and shared unknowns, visit, pose, field, right-hand side. Returns matrices
     and right-hand sides of each visit, or of each view where there are no visits.
     """
-    layout = problem.layout
-    left = _eliminate(augmented, layout.view)
-    if problem.effects is not None:
-        left = sum_by(problem.effects.visit, len(problem.effects.visit_group), left)
-        sigma = problem.effects.visit_sigmas
-        own = np.arange(layout.visit.start, layout.visit.stop)
-        left[:, own, own] += sigma**-2.0
-        left[:, own, -1] -= state.visits / sigma**2
-        left = _eliminate(left, layout.visit)
-    return left[:, :-1, :-1], left[:, :-1, -1]
+    layout, width = problem.layout, augmented.shape[1] - 1
+    # What is eliminated comes last.
+    order = np.r_[layout.magnification, layout.size : width, layout.visit, layout.view]
+    matrix, right = augmented[:, order[:, None], order], augmented[:, order, -1]
+    for damping in (0.0, ROUNDING_DAMPING):
+        with suppress(np.linalg.LinAlgError):
+            return _eliminate(problem, state, matrix, right, damping)
+    raise _rounded("views")
 
 
-def _eliminate(augmented: Array, own: slice) -> Array:
-    """Eliminate the unknowns in some columns by the Schur complement."""
-    keep = np.r_[0 : own.start, own.stop : augmented.shape[1]]
-    cross = augmented[:, own][:, :, keep]
-    left = augmented[:, keep[:, None], keep]
-    return left - np.swapaxes(cross, 1, 2) @ invert_scaled(augmented[:, own, own]) @ cross
+def _eliminate(
+    problem: Problem, state: State, matrix: Array, right: Array, damping: float
+) -> tuple[Array, Array]:
+    first = matrix.shape[1] - problem.layout.of_view.size
+    matrix, right, _ = eliminate(matrix, right, first, damping)
+    if problem.effects is None:
+        return matrix, right
+    sigma, count = problem.effects.visit_sigmas, len(problem.effects.visit_group)
+    matrix, right = (sum_by(problem.effects.visit, count, sums) for sums in (matrix, right))
+    own = np.arange(first - len(sigma), first)
+    matrix[:, own, own] += sigma**-2.0
+    right[:, own] -= state.visits / sigma**2
+    matrix, right, _ = eliminate(matrix, right, first - len(sigma), damping)
+    return matrix, right
 
 
 def _second_differences(count: int) -> Array:
