@@ -177,9 +177,9 @@ class _Transforms:
     slopes: Array
 
     def project(self, seen: NDArray[np.complex128]) -> tuple[Array, Array, Array]:
-        """Project coefficients: amplitudes (s,), power (s,) and amplitudes (2, s) of the derivatives."""
-        h, k = _harmonics()
-        uu, vv, uv = self.slopes
+        """Project coefficients (f, n): amplitudes (s, n), power (s, n) and amplitudes (2, s, n) of the derivatives."""
+        h, k = (order[:, None] for order in _harmonics())
+        uu, vv, uv = self.slopes[:, :, None]
         u, v = self.values @ (h * seen.imag), self.values @ (k * seen.imag)
         slopes = np.stack([vv * u - uv * v, uu * v - uv * u]) / np.maximum(uu * vv - uv * uv, 1e-12)
         return self.values @ seen.real, slopes[0] * u + slopes[1] * v, slopes
@@ -188,12 +188,9 @@ class _Transforms:
         self, seen: NDArray[np.complex128], centres: list[tuple[float, float]]
     ) -> tuple[float, float]:
         """Return which of these centres explains most of some coefficients, with a relief."""
-
-        def explained(centre: tuple[float, float]) -> float:
-            amplitude, odd, _ = self.project(seen * _move(*centre))
-            return float(np.max(amplitude**2 + odd))
-
-        return max(centres, key=explained)
+        moved = np.stack([seen * _move(*centre) for centre in centres], axis=1)
+        amplitude, odd, _ = self.project(moved)
+        return centres[int(np.argmax(np.max(amplitude**2 + odd, axis=0)))]
 
 
 @dataclass(frozen=True)
@@ -403,7 +400,8 @@ def _fit_relief(seen: NDArray[np.complex128]) -> _Relief:
     u, v = shapes.some.find_centre(seen, [(u, v) for u in RELIEF_SHIFTS for v in RELIEF_SHIFTS])
     steps = 0.5 * (RELIEF_SHIFTS[1] - RELIEF_SHIFTS[0]) * np.array([-1.0, 0.0, 1.0])
     centre = shapes.some.find_centre(seen, [(u + a, v + b) for a in steps for b in steps])
-    even, odd, slopes = shapes.transforms.project(seen * _move(*centre))
-    left = 1.0 - (even**2 + odd) / max(float(np.sum(np.abs(seen) ** 2)), 1e-30)
+    moved = (seen * _move(*centre))[:, None]
+    even, odd, slopes = shapes.transforms.project(moved)
+    left = 1.0 - (even**2 + odd)[:, 0] / max(float(np.sum(np.abs(seen) ** 2)), 1e-30)
     best = int(np.argmin(left))
-    return _Relief(left, centre, slopes[:, best] / (even[best] or 1.0))
+    return _Relief(left, centre, slopes[:, best, 0] / (even[best, 0] or 1.0))

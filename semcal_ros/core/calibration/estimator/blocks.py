@@ -276,6 +276,12 @@ class Problem:
         return np.repeat(np.arange(len(self.group)), np.diff(self.starts))
 
     @cached_property
+    def points_of_views(self) -> tuple[slice, ...]:
+        """Where the points of each view stand."""
+        pairs = zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True)
+        return tuple(slice(first, last) for first, last in pairs)
+
+    @cached_property
     def points_on_squares(self) -> dict[str, Mask]:
         """The unknowns of sizes of squares, and for each the (N,) points on squares of that size."""
         out = {}

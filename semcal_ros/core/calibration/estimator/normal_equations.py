@@ -62,8 +62,8 @@ def normal_equations(
     matrix = np.swapaxes(priors, 1, 2) @ priors
     columns = corners.columns
     observed = np.empty((len(problem.group), len(columns), len(columns)))
-    for v, own in enumerate(observed):
-        x, y = corners.rows[:, :, problem.starts[v] : problem.starts[v + 1]]
+    for own, points in zip(observed, problem.points_of_views, strict=True):
+        x, y = corners.rows[:, :, points]
         np.matmul(x, x.T, out=own)
         own += y @ y.T
     matrix[:, columns[:, None], columns] += observed

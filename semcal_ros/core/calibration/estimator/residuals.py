@@ -185,10 +185,8 @@ def _points_and_cameras(problem: Problem, state: State) -> tuple[Array, Array, A
     view = problem.view_of_point
     grid = _shaped_grid(problem, state)
     rotated = np.empty_like(grid)
-    for rotation, first, last in zip(
-        state.rotations, problem.starts[:-1], problem.starts[1:], strict=True
-    ):
-        np.matmul(grid[first:last], rotation.T, out=rotated[first:last])
+    for rotation, points in zip(state.rotations, problem.points_of_views, strict=True):
+        np.matmul(grid[points], rotation.T, out=rotated[points])
     cameras = problem.cameras(state.theta)[problem.group]
     if problem.effects is not None:
         cameras[:, 0] += state.visits[problem.effects.visit, 0] / problem.unit_m
@@ -217,20 +215,19 @@ def whitened_norm(problem: Problem, residuals_px: Array) -> Array:
     return np.hypot(xx * x, yx * x + yy * y)
 
 
-def _huber(norm: Array) -> tuple[Array, Array]:
-    """Return Huber's loss and weight of whitened residual norms.
+def _loss(norm: Array) -> Array:
+    """Return Huber's loss of whitened residual norms; that of a point without a projection is large."""
+    return np.where(np.isfinite(norm), huber_loss(norm, HUBER_SIGMAS), LOSS_LOST)
 
-    A point without a projection has a large loss and no weight.
-    """
-    seen = np.isfinite(norm)
-    norm = np.where(seen, norm, 0.0)
-    loss, weight = huber_loss(norm, HUBER_SIGMAS), huber_weight(norm, HUBER_SIGMAS)
-    return np.where(seen, loss, LOSS_LOST), np.where(seen, weight, 0.0)
+
+def _weight(norm: Array) -> Array:
+    """Return Huber's weight of whitened residual norms; a point without a projection has none."""
+    return np.where(np.isfinite(norm), huber_weight(norm, HUBER_SIGMAS), 0.0)
 
 
 def view_costs(problem: Problem, state: State) -> Array:
     """Return (V,) half robust sums of squares of corners, and of what is known of the views besides."""
-    loss, _ = _huber(whitened_norm(problem, corner_residuals(problem, state)))
+    loss = _loss(whitened_norm(problem, corner_residuals(problem, state)))
     return np.add.reduceat(loss, problem.starts[:-1]) + 0.5 * _known_squares(problem, state)
 
 
@@ -240,7 +237,7 @@ def view_squares(problem: Problem, state: State) -> Array:
     A view with a corner that has no projection has an infinite one: to move it there is no improvement.
     """
     norm = whitened_norm(problem, corner_residuals(problem, state))
-    weight = _huber(norm)[1]
+    weight = _weight(norm)
     square = np.where(weight > 0.0, norm**2 * weight, np.inf)
     return np.bincount(problem.view_of_point, weights=square) + _known_squares(problem, state)
 
@@ -307,9 +304,12 @@ class _CornerDerivatives:
     @cached_property
     def by_grid_point(self) -> Array:
         """(2, 3, N) by the points of the grid before their squares grow, in its axes."""
-        rotations = self.state.rotations[self.problem.view_of_point]
-        by_point = np.einsum("kin,nij->kjn", self.by_point, rotations)
-        return np.asarray(by_point * self.square_sizes)
+        out = np.empty_like(self.by_point)
+        for rotation, points in zip(
+            self.state.rotations, self.problem.points_of_views, strict=True
+        ):
+            np.matmul(rotation.T, self.by_point[:, :, points], out=out[:, :, points])
+        return out * self.square_sizes
 
     @cached_property
     def square_sizes(self) -> Array:
@@ -328,9 +328,9 @@ class _CornerDerivatives:
 
     def by_squares(self) -> Array:
         """By the relative sizes of the squares."""
-        grid = _shaped_grid(self.problem, self.state)
-        along = np.einsum("kjn,nj->kn", self.by_grid_point, grid)
-        along = along / self.square_sizes**2
+        x, y, z = (_shaped_grid(self.problem, self.state) / self.square_sizes[:, None] ** 2).T
+        dx, dy, dz = np.moveaxis(self.by_grid_point, 1, 0)
+        along = x * dx + y * dy + z * dz
         shown = self.problem.points_on_squares.values()
         return np.stack([along * points for points in shown], axis=1)
 
@@ -380,7 +380,7 @@ def corner_rows(problem: Problem, state: State, *, poses_only: bool = False) -> 
     """
     derivatives = _CornerDerivatives(problem, state, poses_only=poses_only)
     left = problem.observed_px - derivatives.jacobians.xy - _drift_shift(problem, state)
-    huber = _huber(whitened_norm(problem, left))[1]
+    huber = _weight(whitened_norm(problem, left))
     layout = problem.layout.of_view if poses_only else problem.layout.only(_CORNER_DERIVATIVES)
     rows = np.empty((2, layout.size + 1, len(left)))
     for block in layout.blocks:
@@ -405,10 +405,10 @@ def _turn_curvature(
     x = xx * left[:, 0]
     y = yx * left[:, 0] + yy * left[:, 1]
     pull = np.stack([xx * x + yx * y, yy * y]) * huber
-    force = np.einsum("kjn,kn->nj", derivatives.by_point, pull)
-    force[huber == 0.0] = 0.0
-    products = force[:, :, None] * derivatives.rotated[:, None, :]
-    moment = np.add.reduceat(products, problem.starts[:-1], axis=0)
+    force = derivatives.by_point[0] * pull[0] + derivatives.by_point[1] * pull[1]
+    force[:, huber == 0.0] = 0.0
+    points = problem.points_of_views
+    moment = np.stack([force[:, own] @ derivatives.rotated[own] for own in points])
     symmetric = 0.5 * (moment + np.swapaxes(moment, 1, 2))
     trace = np.trace(moment, axis1=1, axis2=2)
     return np.asarray(trace[:, None, None] * np.eye(3) - symmetric)
