@@ -23,6 +23,8 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.calibration import select
+from semcal_ros.core.calibration.estimator import residual_field_fit
+from semcal_ros.core.calibration.estimator.normal_equations import eliminate
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses, rms_by_magnification
 from semcal_ros.core.calibration.options import CalibrationOptions
 from semcal_ros.core.calibration.pipeline import calibrate_views
@@ -204,6 +206,27 @@ def test_predicted_errors_are_as_large_as_the_errors():
             scores.extend(bend / sigma)
     # The scores along each axis of a calibration are nearly one: a chi-square with 8 degrees of freedom, 99 % of it.
     assert 0.41 < np.sqrt(np.mean(np.square(scores))) < 1.66
+
+
+@pytest.mark.parametrize("once", [True, False], ids=["once", "always"])
+def test_views_that_rounding_makes_unsolvable_have_no_field(once, monkeypatch):
+    calls = []
+
+    def rounded(*arguments):
+        calls.append(arguments)
+        if once and len(calls) > 1:
+            return eliminate(*arguments)
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(residual_field_fit, "eliminate", rounded)
+    if once:
+        assert _calibrate(WAVY, "on", views=3, magnifications=(1000.0,)).model.residual is not None
+        # A little damping makes up for it.
+        assert calls[0][3] == 0.0 < calls[1][3]
+        return
+    assert _calibrate(WAVY, "auto", views=3, magnifications=(1000.0,)).model.residual is None
+    with pytest.raises(UnusableCalibrationError, match="rounding has made unsolvable"):
+        _calibrate(WAVY, "on", views=3, magnifications=(1000.0,))
 
 
 def test_modes_and_methods_are_checked():
