@@ -24,7 +24,7 @@ It fails where what moves has no structure and covers none, and where its struct
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -38,11 +38,13 @@ from semcal_ros.core.registration.noise_spectrum import passed_variance, shared_
 from semcal_ros.core.registration.odd_bodies import OddBodies, bodies_at_edges, find_odd_bodies
 from semcal_ros.core.registration.thresholds import (
     AGREEMENT_SIGMAS,
+    APART_MIN,
     BESIDES_MAX,
     BEST_TILES,
     BODY_TILES_MIN,
     CHANGE_PRECISION,
     COMPLETE_SHARE_MIN,
+    COVERED_SIGMAS,
     DISAGREEING_MAX,
     GAIN_MIN,
     GAIN_RATIO_MAX,
@@ -149,19 +151,17 @@ def information_weights(level: PyramidLevel, noise: TileNoise) -> Array:
     A tile next to a better one counts as much: structure that is cut by the edge of what counts pulls the shift.
     """
     gradient, shows = level.normal_matrices[..., :2, :2], level.shows_structure
-    return _spread(_share_of_structure(gradient, level.pixel_counts, level.sigma_px, noise, shows))
+    return _measure_structure(gradient, level.pixel_counts, level.sigma_px, noise, shows)[1]
 
 
-def _spread(own: Array) -> Array:
-    """The weights of tiles, each as large as the best of it and those around."""
-    return np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)))
-
-
-def _share_of_structure(
+def _measure_structure(
     gradient: Array, pixels: Array, sigma_px: float, noise: TileNoise, shows: Mask | None
-) -> Array:
-    """(rows, cols) 0 to 1: what of the gradients of each tile for itself is structure; 0 where it neither ``shows`` any
-    nor has more of a gradient than noise.
+) -> tuple[Array, Array]:
+    """(rows, cols) 0 to 1 each: what of the gradients of each tile for itself is structure, 0 where it neither
+    ``shows`` any nor has more of a gradient than noise; and what it counts as.
+
+    A tile next to a better one counts as much. Where no tile for itself has most of the structure, but all together do,
+    each counts as what they have in the mean.
     """
     energy = gradient[..., 0, 0] + gradient[..., 1, 1]
     expected = 2.0 * pixels * noise.gradient * noise.reference / max(noise.passed, 1e-12)
@@ -172,7 +172,14 @@ def _share_of_structure(
     if shows is not None:
         is_structure = is_structure | shows
     signal = np.where(is_structure, np.maximum(excess, 0.0), 0.0)
-    return np.asarray(signal / np.maximum(signal + expected, 1e-30))
+    own = np.asarray(signal / np.maximum(signal + expected, 1e-30))
+    weights: Array = np.asarray(cv2.dilate(own, np.ones((3, 3), np.uint8)), dtype=np.float64)
+    faint = ~is_structure
+    rest = float(excess[faint].sum())
+    by_chance = AGREEMENT_SIGMAS * float(np.sqrt(np.sum(scatter[faint] ** 2)))
+    if shows is None and rest > max(by_chance, float(signal.sum())):
+        weights = np.maximum(weights, rest / (rest + float(expected[faint].sum())))
+    return own, weights
 
 
 def find_agreement(
@@ -192,8 +199,7 @@ def find_agreement(
     """
     shared, count = shared_pixels(tiles.sigma_px), tiles.pixels
     shows = tiles.shows_structure
-    own = _share_of_structure(tiles.gradient, count, tiles.sigma_px, noise, shows)
-    weights = _spread(own)
+    own, weights = _measure_structure(tiles.gradient, count, tiles.sigma_px, noise, shows)
     gain = _bound_gain(tiles, noise, weights)
     raw = tiles.image - 2.0 * gain * tiles.common + gain**2 * tiles.reference
     # Interpolation hides noise from where it is measured; what the best tiles leave is noise, too.
@@ -216,6 +222,7 @@ def find_agreement(
     )
     disagrees = lacks | exceeds
     louder = replace(noise, reference=hidden * noise.reference, image=hidden * noise.image)
+    disagrees = disagrees | _find_covered(tiles, louder, shared)
     disagrees = disagrees | _moves(
         tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
     )
@@ -239,6 +246,99 @@ def find_agreement(
     energy = weights * (tiles.gradient[..., 0, 0] + tiles.gradient[..., 1, 1])
     pull = float(energy[disagrees].sum() / max(energy.sum(), 1e-30))
     return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights, found)
+
+
+def _find_covered(tiles: TileStatistics, noise: TileNoise, shared: float) -> Mask:
+    """The tiles of bodies that are brighter or darker than the rest, and where the specimen is missing.
+
+    The gain is that of the brightness that shows the specimen: what covers it has none of its own.
+    """
+    found = SpecimenSeen(
+        tiles.offset,
+        tiles.reference - tiles.pixels * noise.reference,
+        tiles.common,
+        tiles.pixels,
+        noise,
+        shared,
+    )
+    least = (1.0 - MISSING_MAX) * found.find_gain()
+    return found.find_missing(least, least) if least > 0.0 else np.zeros_like(found.bright)
+
+
+@dataclass(frozen=True)
+class SpecimenSeen:
+    """What tiles (rows, cols) show of a specimen, beside their brightness ``offset``.
+
+    ``structure`` are the squares of the reference without its noise, and ``common`` its products with the image.
+    """
+
+    offset: Array
+    structure: Array
+    common: Array
+    pixels: Array
+    noise: TileNoise
+    shared: float
+
+    @cached_property
+    def bright(self) -> Mask:
+        """The tiles of the brighter one of two classes (Otsu 1979, doi:10.1109/TSMC.1979.4310076)."""
+        least, most = float(self.offset.min()), float(self.offset.max())
+        levels = (self.offset - least) * (255.0 / max(most - least, 1e-30))
+        kind = cv2.THRESH_BINARY + cv2.THRESH_OTSU
+        return np.asarray(cv2.threshold(np.rint(levels).astype(np.uint8), 0, 255, kind)[1] > 0)
+
+    def variance(self, least: float) -> Array:
+        """Variance of the products less ``least`` times the structure."""
+        reference, image = self.noise.reference, self.noise.image
+        by_noise = self.pixels * reference * (image + 2.0 * least**2 * reference)
+        seen = np.maximum(self.structure, 0.0) * (image + reference)
+        return np.asarray(self.shared * (by_noise + seen))
+
+    def find_gain(self) -> float:
+        """The gain of the class that shows the specimen more surely; 0 where neither does."""
+        gain, most, variance = 0.0, AGREEMENT_SIGMAS, self.variance(0.0)
+        for part in (self.bright, ~self.bright):
+            common = float(self.common[part].sum())
+            sigmas = common / max(float(np.sqrt(variance[part].sum())), 1e-30)
+            if sigmas > most:
+                # What is left of a structure without its noise may be anything.
+                gain = common / max(float(self.structure[part].sum()), 0.5 * common)
+                most = sigmas
+        return gain
+
+    @cached_property
+    def apart(self) -> float:
+        """By how many of their standard deviations the two classes differ."""
+        parts = [self.offset[self.bright], self.offset[~self.bright]]
+        if min(len(part) for part in parts) == 0:
+            return 0.0
+        within = sum(float(part.var()) * len(part) for part in parts) / self.offset.size
+        return float(parts[0].mean() - parts[1].mean()) / max(np.sqrt(within), 1e-30)
+
+    def find_missing(self, bright: float, dark: float) -> Mask:
+        """The tiles of bodies of one class where the specimen is missing.
+
+        These together show less of it than a gain of ``bright`` or ``dark``, since no tile for itself tells that of a
+        faint one. Where the classes differ as those of a body and the ground do, what does not surely show the specimen
+        is missing: what is left out then tells next to nothing.
+        """
+        missing = np.zeros(self.offset.shape, dtype=bool)
+        seen = self.variance(0.0)
+        for part, least in ((self.bright, bright), (~self.bright, dark)):
+            number, labels = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
+            ones = np.ones(part.shape)
+            size, structure, common, by_chance, variance = (
+                np.bincount(labels.ravel(), values.ravel(), number)
+                for values in (ones, self.structure, self.common, seen, self.variance(least))
+            )
+            lack = least * structure - common
+            # What is seen at all is nearer to the least than to nothing.
+            bodies = (lack > AGREEMENT_SIGMAS * np.sqrt(variance)) & (lack > common)
+            if self.apart > APART_MIN:
+                bodies |= common < COVERED_SIGMAS * np.sqrt(by_chance)
+            bodies &= size >= BODY_TILES_MIN
+            missing |= part & bodies[labels]
+        return missing
 
 
 def _find_odd(

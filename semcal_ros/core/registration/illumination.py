@@ -37,7 +37,7 @@ import cv2
 import numpy as np
 
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask, median
-from semcal_ros.core.registration.agreement import TileNoise
+from semcal_ros.core.registration.agreement import SpecimenSeen, TileNoise
 from semcal_ros.core.registration.noise_spectrum import gaussian_taps, shared_pixels
 from semcal_ros.core.registration.thresholds import (
     AGREEMENT_SIGMAS,
@@ -240,7 +240,20 @@ def measure_illumination(
     )
     brightness = np.stack([sums.cross[..., 3], own[..., 2, 3]], axis=-1) / pixels[..., None]
     offset = brightness[..., 0] - usual_gain * brightness[..., 1]
-    gain, agrees = _find_gains(tiles, free, pixels == np.max(pixels))
+    # Beside their means alone, tiles show more of a faint specimen.
+    means, of_image = own[..., 2, 3], sums.cross[..., 3]
+    specimen = SpecimenSeen(
+        offset,
+        own[..., 2, 2] - means**2 / pixels - pixels * noise.reference,
+        sums.cross[..., 2] - means * of_image / pixels,
+        pixels,
+        noise,
+        tiles.shared,
+    )
+    # A shadow takes contrast with the brightness; what is brighter and takes it is a body.
+    covered = specimen.find_missing((1.0 - MISSING_MAX) * usual_gain, tiles.least)
+    whole = (pixels == np.max(pixels)) & ~covered
+    gain, agrees = _find_gains(tiles, free, whole)
     if agrees.mean() < LIGHT_SHARE_MIN:
         return None
     # Of smoothed noise, few pixels are independent.

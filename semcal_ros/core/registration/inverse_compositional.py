@@ -251,8 +251,8 @@ class TileStatistics:
         Width of the smoothing.
     reference, image, common
         (rows, cols) sums of squares of the reference and of the image, and of their products.
-    gain
-        (rows, cols) image grey levels per reference grey level.
+    gain, offset
+        (rows, cols) image grey levels per reference grey level, and by how much the image is brighter than that.
     gradient
         (rows, cols, 2, 2) sums of products of the reference's gradients.
     shows_structure
@@ -269,6 +269,7 @@ class TileStatistics:
     image: Array
     common: Array
     gain: Array
+    offset: Array
     gradient: Array
     shows_structure: Mask | None
     scores: Array
@@ -295,6 +296,7 @@ def _make_statistics(
         sums.energy - cross[..., 3] ** 2 / pixels,
         cross[..., 2] - own[..., 2, 3] * cross[..., 3] / pixels,
         gain,
+        offset,
         own[..., :2, :2],
         shows if shows is None else shows[window.rows, window.cols],
         residual,

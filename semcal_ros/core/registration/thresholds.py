@@ -278,6 +278,11 @@ MISSING_MAX = TABLE.stated(
     "Of a tile that may be missing: contrast changes with charging, focus and contamination by some tenths over a "
     "field.",
 )
+APART_MIN = TABLE.derived(
+    "APART_MIN", 4.5, "standard deviations",
+    "Between the means of two classes of brightness, of what each scatters by, for a body and its ground: the halves "
+    "of a normal distribution are 2.65 apart, those of a uniform one, as of light that rises evenly, 3.46.",
+)
 BESIDES_MAX = TABLE.measured(
     "BESIDES_MAX", 0.6, "of the structure",
     "Of a tile that may be there besides, for the same reason. With 0.733, 2 of 19 cases are decided otherwise; "

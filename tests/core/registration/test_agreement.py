@@ -125,3 +125,64 @@ def test_one_tile_alone_is_no_body() -> None:
     tiles = np.zeros((6, 6), dtype=bool)
     tiles[2, 3] = True
     assert MovingTiles.of(tiles, np.zeros(2), np.ones(2)).share == 0.0
+
+
+def faint_ground(
+    seed: int, shift: tuple[float, float], contrast: float, level: float = 0.0, lit: bool = False
+) -> np.ndarray:
+    """A ground that noise nearly hides, a part of it brighter by ``level``: covered by a body, or ``lit``."""
+    picture = GROUND.view(shift, FAINT_SIZE)
+    whole = 110.0 + contrast * picture / picture.std()
+    body = 0.0 if level == 0.0 else FAINT_BODY
+    drawn = whole + level * body if lit else whole * (1.0 - body) + (110.0 + level) * body
+    return np.asarray(drawn + np.random.default_rng(seed).normal(0.0, 22.0, drawn.shape))
+
+
+FAINT_SIZE = 384
+_y, _x = np.mgrid[:FAINT_SIZE, :FAINT_SIZE]
+FAINT_BODY = cv2.GaussianBlur((_x < 150 - 0.2 * np.abs(_y - 190)).astype(np.float64), (0, 0), 1.0)
+
+
+@pytest.mark.parametrize("level", [-30.0, 60.0])
+@pytest.mark.parametrize("contrast", [10.0, 20.0, 30.0])
+def test_a_body_over_a_faint_ground_is_found_by_its_brightness(
+    contrast: float, level: float
+) -> None:
+    shift = (2.3, -1.4)
+    reference = prepare_reference(faint_ground(0, (0.0, 0.0), contrast))
+    image = faint_ground(1, shift, contrast, level)
+    found = register(
+        reference, image, guess_px=np.array(shift) + 0.2, guess_covariance=np.eye(2) * 0.25
+    )
+    assert found.accepted, found.reason
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(found.shift_px - shift) < 3.5 * sigma)
+    assert np.max(sigma) < 2.0 / contrast
+    assert found.moving is not None
+    shown = found.moving.draw((FAINT_SIZE, FAINT_SIZE)) > 0
+    # No tile for itself says that the ground is missing: of a body that few of them see, 3 % are shown.
+    assert shown[FAINT_BODY > 0.99].mean() > 0.75
+    assert shown[FAINT_BODY < 0.01].mean() < 0.02
+
+
+@pytest.mark.parametrize("level", [-30.0, 60.0])
+@pytest.mark.parametrize("contrast", [20.0, 30.0])
+def test_a_faint_ground_that_is_lit_otherwise_is_no_body(contrast: float, level: float) -> None:
+    shift = (2.3, -1.4)
+    reference = prepare_reference(faint_ground(0, (0.0, 0.0), contrast))
+    image = faint_ground(1, shift, contrast, level, lit=True)
+    found = register(
+        reference, image, guess_px=np.array(shift) + 0.2, guess_covariance=np.eye(2) * 0.25
+    )
+    assert found.accepted, found.reason
+    assert found.moving is None
+    assert np.all(np.abs(found.shift_px - shift) < 3.5 * np.sqrt(np.diag(found.covariance)))
+
+
+def test_a_faint_ground_alone_has_no_body() -> None:
+    reference = prepare_reference(faint_ground(0, (0.0, 0.0), 10.0))
+    for seed in range(1, 21):
+        image = faint_ground(seed, (2.3, -1.4), 10.0)
+        found = register(reference, image, guess_px=(2.3, -1.4), guess_covariance=np.eye(2) * 0.25)
+        # Single tiles, by chance.
+        assert found.moving is None or found.moving.share < 0.02
