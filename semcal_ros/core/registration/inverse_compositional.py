@@ -530,6 +530,7 @@ def align_reweighted(
     reweight: Callable[[TileStatistics], Array],
     *,
     looks: bool = True,
+    held: Array | None = None,
 ) -> Alignment | Rejection[MatchFailure]:
     """Refine a shift by those tiles that agree with it.
 
@@ -547,12 +548,14 @@ def align_reweighted(
         From the statistics of the compared tiles to their weights. What it was asked last is where the shift was found.
     looks
         Whether to look at the tiles at the start before the first step; not where the first weights tell what moves.
+    held
+        As for :func:`align`.
 
     Returns
     -------
     The alignment, which may not have converged; or a rejection as of :func:`align`.
     """
-    found = _descend(level, image, start_px, weights, reweight, looks)
+    found = _descend(level, image, start_px, weights, reweight, looks, held)
     return found if isinstance(found, Rejection) else _summarise(*found)
 
 
@@ -582,6 +585,7 @@ def _descend(
     weights: Array,
     reweight: Callable[[TileStatistics], Array],
     looks: bool,
+    held: Array | None = None,
 ) -> tuple[_Comparison, Array, bool, int] | Rejection[MatchFailure]:
     """The last comparison, its covariance, whether it has converged, and the number of passes."""
     shift, passes = np.asarray(start_px, dtype=np.float64), 0
@@ -601,6 +605,7 @@ def _descend(
             None,
             ALL_PIXELS,
             weights,
+            held,
             before=latest,
         )
         if isinstance(comparison, Rejection):

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, Mask
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
 from semcal_ros.core.registration.inverse_compositional import Alignment, align
@@ -148,9 +148,19 @@ def align_across(
     start = guess + offsets[0] * lines.across
     x, y = start.tolist()
     found = align(levels, pyramid, start, held=lines.along)
-    if isinstance(found, Rejection):
-        return found
-    if failure := _compare_halves(found, lines):
+    if not isinstance(found, Rejection):
+        found = known_across(found, lines, guess_covariance)
+    return found if isinstance(found, Rejection) else (replace(peaks[0], shift_px=(x, y)), found)
+
+
+def known_across(
+    found: Alignment, lines: OneDirection, guess_covariance: Array, counts: Mask | None = None
+) -> Alignment | Rejection[MatchFailure]:
+    """The alignment with nothing stated along lines; a rejection where the halves of the image disagree across them.
+
+    ``counts`` (rows, cols) are the tiles that show the specimen; None where all do.
+    """
+    if failure := _compare_halves(found, lines, counts):
         return failure
     # Where the place along the lines is wrong, an angle that is wrong shifts what lies across.
     aside = float(lines.along @ guess_covariance @ lines.along)
@@ -159,7 +169,7 @@ def align_across(
     covariance += HELD_SIGMA_PX**2 * np.outer(lines.along, lines.along)
     # A shear is one of rows, of which a part shows.
     unknown = np.full(4, np.nan), np.full((4, 4), np.inf)
-    alone = replace(
+    return replace(
         found,
         covariance=covariance,
         joint_px=unknown[0],
@@ -167,16 +177,19 @@ def align_across(
         half_difference_px=np.zeros((2, 2)),
         half_variance=np.full((2, 2), np.inf),
     )
-    return replace(peaks[0], shift_px=(x, y)), alone
 
 
-def _compare_halves(found: Alignment, lines: OneDirection) -> Rejection[MatchFailure] | None:
+def _compare_halves(
+    found: Alignment, lines: OneDirection, counts: Mask | None
+) -> Rejection[MatchFailure] | None:
     """Reject an alignment whose halves are shifted differently across the lines."""
     tiles = found.tile_statistics()
     if tiles is None:
         return None
     scores = tiles.scores @ lines.across
     weights = np.einsum("i,rcij,j->rc", lines.across, tiles.gradient, lines.across)
+    if counts is not None:
+        scores, weights = scores * counts, weights * counts
     noise = float(np.sum(scores**2) / max(np.sum(weights), 1e-30))
     rows, cols = (n // 2 for n in scores.shape)
     halves = (

@@ -69,7 +69,9 @@ from semcal_ros.core.registration.one_direction import OneDirection, align_acros
 from semcal_ros.core.registration.periodicity import is_fine
 from semcal_ros.core.registration.reference import Reference, Region, RegistrationSettings
 from semcal_ros.core.registration.specimen import (
+    are_edges,
     find_moving,
+    keep_across,
     keep_specimen,
     look_at_whole,
     noise_beside_tools,
@@ -508,20 +510,31 @@ def _register_across(
     origin = np.subtract(inside[:2], reference.region[:2]).astype(np.float64)
     limits, pyramid = reference.settings, Pyramid(gray)
     guess = np.asarray(guess_px, dtype=np.float64) - origin
+    spread = np.asarray(guess_covariance, dtype=np.float64)
     found = align_across(
         reference.coarse,
         reference.levels,
         pyramid,
         lines,
         guess,
-        np.asarray(guess_covariance, dtype=np.float64),
+        spread,
         limits.min_competing_height,
     )
-    if isinstance(found, Rejection):
-        return Registration(unmeasured_alignment(), float("nan"), found)
-    peak, alignment = found
     image_noise = estimate_noise_variance(_texture(gray, inside, limits))
-    whole = look_at_whole(reference, alignment, image_noise)
+    whole = (
+        None if isinstance(found, Rejection) else look_at_whole(reference, found[1], image_noise)
+    )
+    kept = None
+    if whole is None or not (whole.is_complete or are_edges(whole)):
+        kept = keep_across(reference, pyramid, lines, guess, spread)
+    moving, share = None, 1.0
+    if kept is not None and isinstance(kept.alignment, Alignment):
+        peak, alignment = kept.peak, kept.alignment
+        moving, share, whole = kept.moving, kept.share, None
+    elif isinstance(found, Rejection):
+        return Registration(unmeasured_alignment(), float("nan"), found)
+    else:
+        peak, alignment = found
     signals = _measure_signals(reference, image_noise, alignment)
     correlation = signals.correlation
     # Only the direction across is judged.
@@ -541,7 +554,17 @@ def _register_across(
     if rejection is None and follow_px is not None:
         rejection = refuse_unless_followed(reference, alignment, image_noise, follow_px)
     moved = replace(alignment, shift_px=alignment.shift_px + origin)
-    return Registration(moved, correlation, rejection, along=lines.along, contrast=signals.contrast)
+    if moving is not None:
+        moving = replace(moving, corner_px=moving.corner_px + np.array(inside[:2]))
+    return Registration(
+        moved,
+        correlation,
+        rejection,
+        moving=moving,
+        share=share,
+        along=lines.along,
+        contrast=signals.contrast,
+    )
 
 
 def _register_in_its_light(

@@ -45,6 +45,7 @@ from semcal_ros.core.registration.inverse_compositional import (
 )
 from semcal_ros.core.registration.noise_spectrum import estimate_noise_variance
 from semcal_ros.core.registration.normalised_correlation import CoarsePeak
+from semcal_ros.core.registration.one_direction import OneDirection, known_across
 from semcal_ros.core.registration.reference import Reference, Region
 from semcal_ros.core.registration.thresholds import (
     HYPOTHESES_MAX,
@@ -226,6 +227,42 @@ def keep_specimen(
     if follow_px is not None:
         share = _share_inside(best.alignment, best.agreement, reference, follow_px)
     return Kept(best.alignment, best.start, moving, share, other_px)
+
+
+def are_edges(agreement: Agreement) -> bool:
+    """Whether lines may be the edges of a thing, beside which other bodies lie: they do not run through the image."""
+    runs_through = float(np.mean(agreement.informs > 0.0)) > MAJORITY_SHARE
+    return agreement.odd.in_doubt or bool(np.any(agreement.odd.largest) and not runs_through)
+
+
+def keep_across(
+    reference: Reference, pyramid: Pyramid, lines: OneDirection, guess: Array, spread: Array
+) -> Kept | None:
+    """What moves across lines as predicted, at the predicted place along them; None where the prediction is uncertain,
+    or too little does.
+    """
+    level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
+    predicted = float(lines.across @ spread @ lines.across)
+    if predicted > WELL_PREDICTED_PX**2:
+        return None
+    judge = _Judge(reference, noise, None, guess, 0.0, looks_for_odd=False)
+    first = judge.first(information_weights(level, noise))
+    found = align_reweighted(level, pyramid, guess, first, judge, held=lines.along)
+    agreement = judge.latest
+    if isinstance(found, Rejection) or not found.converged or agreement is None:
+        return None
+    innovation = float(lines.across @ (found.shift_px - guess))
+    is_near = innovation**2 <= NEAR_CHI2_MAX * (predicted + SAME_SHIFT_PX**2)
+    is_most = agreement.share > MAJORITY_SHARE and agreement.are_bodies
+    if not (is_near and is_most) or are_edges(agreement):
+        return None
+    alone = known_across(found, lines, spread, agreement.weights > 0.0)
+    if isinstance(alone, Rejection):
+        return None
+    x, y = guess.tolist()
+    peak = CoarsePeak((x, y), float("nan"), float("nan"), 1.0)
+    moving = find_moving(reference, found, agreement)
+    return Kept(alone, peak, moving, agreement.share, np.full(2, np.nan))
 
 
 class _Judge:

@@ -186,3 +186,39 @@ def test_a_faint_ground_alone_has_no_body() -> None:
         found = register(reference, image, guess_px=(2.3, -1.4), guess_covariance=np.eye(2) * 0.25)
         # Single tiles, by chance.
         assert found.moving is None or found.moving.share < 0.02
+
+
+def scratched(seed: int, across_px: float, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Scratches in one direction, moved across themselves, with a flat body that comes in from the left."""
+    u = np.cos(0.3) * _x + np.sin(0.3) * _y - across_px
+    places = np.random.default_rng(7).uniform(-100.0, 500.0, 90)
+    scratches = np.sum([np.exp(-0.5 * ((u - place) / 1.5) ** 2) for place in places], axis=0)
+    body = (_x < reach - 0.2 * np.abs(_y - 190)).astype(np.float64)
+    body = cv2.GaussianBlur(body, (0, 0), 1.0)
+    drawn = (60.0 + 60.0 * scratches) * (1.0 - body) + 190.0 * body
+    rng = np.random.default_rng(seed)
+    return np.asarray(drawn + rng.normal(0.0, 10.0, drawn.shape)), body
+
+
+@pytest.mark.parametrize("reach", [70.0, 150.0])
+def test_across_lines_a_shift_is_measured_beside_a_body(reach: float) -> None:
+    across = np.array([np.cos(0.3), np.sin(0.3)])
+    reference = prepare_reference(scratched(0, 0.0, -50.0)[0])
+    image, body = scratched(1, 1.7, reach)
+    found = register(
+        reference,
+        image,
+        guess_px=1.9 * across,
+        guess_covariance=np.eye(2) * 0.25,
+        takes_lines=True,
+    )
+    assert found.accepted, found.reason
+    assert found.along is not None
+    assert abs(float(found.along @ across)) < 0.01
+    sigma = float(np.sqrt(across @ found.covariance @ across))
+    assert sigma < 0.03
+    assert abs(float(found.shift_px @ across) - 1.7) < 4.0 * sigma
+    assert found.moving is not None
+    shown = found.moving.draw((FAINT_SIZE, FAINT_SIZE)) > 0
+    assert shown[body > 0.99].mean() > 0.7
+    assert shown[body < 0.01].mean() < 0.05
