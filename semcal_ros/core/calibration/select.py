@@ -513,7 +513,22 @@ def _grid_pattern(setup: Setup, adjustment: Adjustment, field: ResidualField) ->
 def _add_field(
     setup: Setup, adjustment: Adjustment, *, always: bool
 ) -> tuple[Adjustment, FittedField | None, GridPattern | None]:
-    """Add a residual field, or return the adjustment unchanged where it is not worthwhile.
+    """Add a residual field, or return the adjustment unchanged where it is not worthwhile, or where rounding leaves no
+    equations that can be solved, unless there is one ``always``.
+    """
+    try:
+        return _fit_field(setup, adjustment, always=always)
+    except UnusableCalibrationError:
+        if always:
+            raise
+        # What cannot be predicted from the rest does not show that there is a field.
+        return adjustment, None, None
+
+
+def _fit_field(
+    setup: Setup, adjustment: Adjustment, *, always: bool
+) -> tuple[Adjustment, FittedField | None, GridPattern | None]:
+    """Fit a residual field, or return the adjustment unchanged where it is not worthwhile.
 
     What stays with the image is the microscope's; what turns with the grid is the grid's, and no
     field is added for it. The one that predicts views that were left out better decides. Nor is a
@@ -530,16 +545,9 @@ def _add_field(
         if np.any(adjustment.result.lost):
             # A field that moves corners to where the camera shows nothing is none.
             return start, None, None
-        try:
-            system = field_system(setup, adjustment.problem, adjustment.result, field)
-            if turn < CHOOSING_ROUNDS:
-                choice = choose_field(setup, system, blank)
-        except UnusableCalibrationError:
-            if always:
-                raise
-            # What cannot be predicted from the rest does not show that there is a field.
-            return start, None, None
+        system = field_system(setup, adjustment.problem, adjustment.result, field)
         if turn < CHOOSING_ROUNDS:
+            choice = choose_field(setup, system, blank)
             if not (choice.worthwhile or always):
                 return start, None, None
             if turn == 0 and setup.shared and not always:

@@ -222,7 +222,7 @@ def find_agreement(
     )
     disagrees = lacks | exceeds
     louder = replace(noise, reference=hidden * noise.reference, image=hidden * noise.image)
-    disagrees = disagrees | _find_covered(tiles, louder, shared)
+    disagrees = disagrees | _find_covered(tiles, louder, shared, median(gain))
     disagrees = disagrees | _moves(
         tiles, weights, louder, shared, ~disagrees, suspected, stretch_px
     )
@@ -248,10 +248,11 @@ def find_agreement(
     return Agreement(np.where(left_out, 0.0, weights), disagrees, share, pull, weights, found)
 
 
-def _find_covered(tiles: TileStatistics, noise: TileNoise, shared: float) -> Mask:
+def _find_covered(tiles: TileStatistics, noise: TileNoise, shared: float, usual: float) -> Mask:
     """The tiles of bodies that are brighter or darker than the rest, and where the specimen is missing.
 
-    The gain is that of the brightness that shows the specimen: what covers it has none of its own.
+    ``usual`` is the gain of most tiles. That of the specimen is the one of the class that shows it: what covers it has
+    none of its own.
     """
     found = SpecimenSeen(
         tiles.offset,
@@ -260,6 +261,7 @@ def _find_covered(tiles: TileStatistics, noise: TileNoise, shared: float) -> Mas
         tiles.pixels,
         noise,
         shared,
+        usual,
     )
     least = (1.0 - MISSING_MAX) * found.find_gain()
     return found.find_missing(least, least) if least > 0.0 else np.zeros_like(found.bright)
@@ -267,9 +269,20 @@ def _find_covered(tiles: TileStatistics, noise: TileNoise, shared: float) -> Mas
 
 @dataclass(frozen=True)
 class SpecimenSeen:
-    """What tiles (rows, cols) show of a specimen, beside their brightness ``offset``.
+    """What tiles show of a specimen, in two classes by their brightness.
 
-    ``structure`` are the squares of the reference without its noise, and ``common`` its products with the image.
+    Attributes
+    ----------
+    offset
+        (rows, cols) by how much the image is brighter than its gain says.
+    structure, common
+        (rows, cols) squares of the reference without its noise, and its products with the image.
+    pixels
+        (rows, cols) number of pixels of each tile that count.
+    noise, shared
+        That of a pixel, which so many pixels have in common.
+    usual
+        The gain of most of the image.
     """
 
     offset: Array
@@ -278,61 +291,78 @@ class SpecimenSeen:
     pixels: Array
     noise: TileNoise
     shared: float
+    usual: float
+
+    @cached_property
+    def _counts(self) -> Mask:
+        """The tiles of which most is compared: the others have no brightness of their own."""
+        return np.asarray(self.pixels >= 0.5 * np.max(self.pixels))
 
     @cached_property
     def bright(self) -> Mask:
         """The tiles of the brighter one of two classes (Otsu 1979, doi:10.1109/TSMC.1979.4310076)."""
-        least, most = float(self.offset.min()), float(self.offset.max())
-        levels = (self.offset - least) * (255.0 / max(most - least, 1e-30))
-        kind = cv2.THRESH_BINARY + cv2.THRESH_OTSU
-        return np.asarray(cv2.threshold(np.rint(levels).astype(np.uint8), 0, 255, kind)[1] > 0)
+        offset = self.offset[self._counts]
+        least, most = float(offset.min()), float(offset.max())
+        levels = np.rint((offset - least) * (255.0 / max(most - least, 1e-30))).astype(np.uint8)
+        limit, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+        bright = np.zeros(self.offset.shape, dtype=bool)
+        bright[self._counts] = levels > limit
+        return bright
+
+    @property
+    def _classes(self) -> tuple[Mask, Mask]:
+        return self.bright, self._counts & ~self.bright
+
+    @cached_property
+    def apart(self) -> float:
+        """By how many of their standard deviations the two classes differ."""
+        parts = [self.offset[part] for part in self._classes]
+        if min(len(part) for part in parts) == 0:
+            return 0.0
+        count = sum(len(part) for part in parts)
+        within = sum(float(part.var()) * len(part) for part in parts) / count
+        # Where nothing scatters, the noise of the means is what is left.
+        noise = self.noise.image + self.usual**2 * self.noise.reference
+        within += self.shared * noise / float(np.max(self.pixels))
+        return float(parts[0].mean() - parts[1].mean()) / max(float(np.sqrt(within)), 1e-30)
 
     def variance(self, least: float) -> Array:
-        """Variance of the products less ``least`` times the structure."""
+        """(rows, cols) variance of the products less ``least`` times the structure."""
         reference, image = self.noise.reference, self.noise.image
         by_noise = self.pixels * reference * (image + 2.0 * least**2 * reference)
-        seen = np.maximum(self.structure, 0.0) * (image + reference)
+        seen = np.maximum(self.structure, 0.0) * (image + self.usual**2 * reference)
         return np.asarray(self.shared * (by_noise + seen))
 
     def find_gain(self) -> float:
         """The gain of the class that shows the specimen more surely; 0 where neither does."""
         gain, most, variance = 0.0, AGREEMENT_SIGMAS, self.variance(0.0)
-        for part in (self.bright, ~self.bright):
+        for part in self._classes:
             common = float(self.common[part].sum())
             sigmas = common / max(float(np.sqrt(variance[part].sum())), 1e-30)
             if sigmas > most:
-                # What is left of a structure without its noise may be anything.
-                gain = common / max(float(self.structure[part].sum()), 0.5 * common)
-                most = sigmas
+                # What is left of a structure without its noise is known to the chance of that.
+                pixels = float(self.pixels[part].sum())
+                chance = np.sqrt(2.0 * self.shared * pixels) * self.noise.reference
+                least = max(AGREEMENT_SIGMAS * float(chance), 1e-30)
+                gain, most = common / max(float(self.structure[part].sum()), least), sigmas
         return gain
 
-    @cached_property
-    def apart(self) -> float:
-        """By how many of their standard deviations the two classes differ."""
-        parts = [self.offset[self.bright], self.offset[~self.bright]]
-        if min(len(part) for part in parts) == 0:
-            return 0.0
-        within = sum(float(part.var()) * len(part) for part in parts) / self.offset.size
-        return float(parts[0].mean() - parts[1].mean()) / max(np.sqrt(within), 1e-30)
-
     def find_missing(self, bright: float, dark: float) -> Mask:
-        """The tiles of bodies of one class where the specimen is missing.
+        """The tiles of bodies of one class each where the specimen is missing.
 
-        These together show less of it than a gain of ``bright`` or ``dark``, since no tile for itself tells that of a
-        faint one. Where the classes differ as those of a body and the ground do, what does not surely show the specimen
-        is missing: what is left out then tells next to nothing.
+        The tiles of a body together show less of it, by 4.5 sigmas, than a gain of ``bright`` or ``dark``, and are
+        nearer to none: no tile for itself tells that of a faint specimen. Where the classes differ as those of a body
+        and the ground do, what does not surely show the specimen is missing, too: it would tell next to nothing.
         """
         missing = np.zeros(self.offset.shape, dtype=bool)
-        seen = self.variance(0.0)
-        for part, least in ((self.bright, bright), (~self.bright, dark)):
+        seen, ones = self.variance(0.0), np.ones(self.offset.shape)
+        for part, least in zip(self._classes, (bright, dark), strict=True):
             number, labels = cv2.connectedComponents(part.astype(np.uint8), connectivity=4)
-            ones = np.ones(part.shape)
             size, structure, common, by_chance, variance = (
                 np.bincount(labels.ravel(), values.ravel(), number)
                 for values in (ones, self.structure, self.common, seen, self.variance(least))
             )
             lack = least * structure - common
-            # What is seen at all is nearer to the least than to nothing.
             bodies = (lack > AGREEMENT_SIGMAS * np.sqrt(variance)) & (lack > common)
             if self.apart > APART_MIN:
                 bodies |= common < COVERED_SIGMAS * np.sqrt(by_chance)

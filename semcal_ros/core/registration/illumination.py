@@ -249,6 +249,7 @@ def measure_illumination(
         pixels,
         noise,
         tiles.shared,
+        usual_gain,
     )
     # A shadow takes contrast with the brightness; what is brighter and takes it is a body.
     covered = specimen.find_missing((1.0 - MISSING_MAX) * usual_gain, tiles.least)

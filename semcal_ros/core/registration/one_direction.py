@@ -156,7 +156,8 @@ def align_across(
 def known_across(
     found: Alignment, lines: OneDirection, guess_covariance: Array, counts: Mask | None = None
 ) -> Alignment | Rejection[MatchFailure]:
-    """The alignment with nothing stated along lines; a rejection where the halves of the image disagree across them.
+    """The alignment with its place along lines marked as not measured; a rejection where the halves of the image
+    disagree across them.
 
     ``counts`` (rows, cols) are the tiles that show the specimen; None where all do.
     """

@@ -521,14 +521,18 @@ def _register_across(
         limits.min_competing_height,
     )
     image_noise = estimate_noise_variance(_texture(gray, inside, limits))
-    whole = (
-        None if isinstance(found, Rejection) else look_at_whole(reference, found[1], image_noise)
-    )
+    whole = None
+    if not isinstance(found, Rejection):
+        whole = look_at_whole(reference, found[1], image_noise)
+    elif found.status is MatchFailure.AMBIGUOUS:
+        # Lines at equal distances agree with any multiple of these.
+        return Registration(unmeasured_alignment(), float("nan"), found)
     kept = None
     if whole is None or not (whole.is_complete or are_edges(whole)):
         kept = keep_across(reference, pyramid, lines, guess, spread)
     moving, share = None, 1.0
-    if kept is not None and isinstance(kept.alignment, Alignment):
+    if kept is not None:
+        assert isinstance(kept.alignment, Alignment)
         peak, alignment = kept.peak, kept.alignment
         moving, share, whole = kept.moving, kept.share, None
     elif isinstance(found, Rejection):

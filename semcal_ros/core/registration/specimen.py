@@ -230,7 +230,9 @@ def keep_specimen(
 
 
 def are_edges(agreement: Agreement) -> bool:
-    """Whether lines may be the edges of a thing, beside which other bodies lie: they do not run through the image."""
+    """Whether lines may be the edges of a thing: other bodies move otherwise, or lie beside lines that do not run
+    through the image.
+    """
     runs_through = float(np.mean(agreement.informs > 0.0)) > MAJORITY_SHARE
     return agreement.odd.in_doubt or bool(np.any(agreement.odd.largest) and not runs_through)
 
@@ -239,11 +241,11 @@ def keep_across(
     reference: Reference, pyramid: Pyramid, lines: OneDirection, guess: Array, spread: Array
 ) -> Kept | None:
     """What moves across lines as predicted, at the predicted place along them; None where the prediction is uncertain,
-    or too little does.
+    too little does, or the stage may have moved within the image.
     """
     level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
     predicted = float(lines.across @ spread @ lines.across)
-    if predicted > WELL_PREDICTED_PX**2:
+    if not predicted <= WELL_PREDICTED_PX**2:
         return None
     judge = _Judge(reference, noise, None, guess, 0.0, looks_for_odd=False)
     first = judge.first(information_weights(level, noise))
@@ -256,11 +258,13 @@ def keep_across(
     is_most = agreement.share > MAJORITY_SHARE and agreement.are_bodies
     if not (is_near and is_most) or are_edges(agreement):
         return None
+    x, y = guess.tolist()
+    peak = CoarsePeak((x, y), float("nan"), float("nan"), 1.0)
+    if _are_lines_elsewhere(_sum_lines(reference, _Hypothesis(found, agreement, peak, None))):
+        return None
     alone = known_across(found, lines, spread, agreement.weights > 0.0)
     if isinstance(alone, Rejection):
         return None
-    x, y = guess.tolist()
-    peak = CoarsePeak((x, y), float("nan"), float("nan"), 1.0)
     moving = find_moving(reference, found, agreement)
     return Kept(alone, peak, moving, agreement.share, np.full(2, np.nan))
 
@@ -479,6 +483,15 @@ class _Lines:
         """Part of the structure above a line, or from it on, that agrees."""
         chosen = (self.y < line) == above
         return float(self.agreeing[chosen].sum() / max(self.whole[chosen].sum(), 1e-30))
+
+
+def _are_lines_elsewhere(lines: _Lines) -> bool:
+    """Whether all lines above or below one disagree and the others agree: a stage that moved leaves them so."""
+    for line in lines.y[1:].tolist():
+        sides = [lines.share(line, above=above) for above in (True, False)]
+        if max(sides) > SPECIMEN_SHARE_MIN and min(sides) < 1.0 - SPECIMEN_SHARE_MIN:
+            return True
+    return False
 
 
 def _sum_lines(reference: Reference, hypothesis: _Hypothesis) -> _Lines:

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcal_ros.core.registration.agreement import MovingTiles
+from semcal_ros.core.registration.agreement import MovingTiles, SpecimenSeen, TileNoise
 from semcal_ros.core.registration.register import Registration, prepare_reference, register
 from tests.helpers.drift_scenes import Texture, noisy
 
@@ -222,3 +222,107 @@ def test_across_lines_a_shift_is_measured_beside_a_body(reach: float) -> None:
     shown = found.moving.draw((FAINT_SIZE, FAINT_SIZE)) > 0
     assert shown[body > 0.99].mean() > 0.7
     assert shown[body < 0.01].mean() < 0.05
+
+
+def test_lines_at_equal_distances_are_refused_also_where_they_are_predicted() -> None:
+    """Any multiple of their distance fits as well, and a prediction that is off by one would choose that."""
+    u = np.cos(0.3) * _x + np.sin(0.3) * _y
+    rng = np.random.default_rng(3)
+    for period in (4.0, 8.0):
+        frames = [
+            60.0 + 30.0 * (1.0 + np.cos(2.0 * np.pi * (u - moved) / period)) for moved in (0.0, 0.4)
+        ]
+        noisy_frames = [frame + rng.normal(0.0, 10.0, frame.shape) for frame in frames]
+        for off in (0.2, period - 0.6):
+            found = register(
+                prepare_reference(noisy_frames[0]),
+                noisy_frames[1],
+                guess_px=(0.4 + off) * np.array([np.cos(0.3), np.sin(0.3)]),
+                guess_covariance=np.eye(2) * 0.9,
+                takes_lines=True,
+            )
+            assert not found.accepted, (period, off, found.shift_px)
+
+
+@pytest.mark.parametrize("part", [0.55, 0.7])
+def test_a_stage_that_moves_within_a_frame_of_lines_is_no_tool(part: float) -> None:
+    across = np.array([np.cos(0.3), np.sin(0.3)])
+    reference = prepare_reference(scratched(0, 0.0, -50.0)[0])
+    image, moved = scratched(1, 1.5, -50.0)[0], scratched(2, 7.5, -50.0)[0]
+    line = int(part * FAINT_SIZE)
+    image[line:] = moved[line:]
+    found = register(
+        reference, image, guess_px=1.5 * across, guess_covariance=np.eye(2) * 0.25, takes_lines=True
+    )
+    assert not found.accepted
+
+
+def test_the_mask_of_a_part_of_an_image_of_lines_lies_at_its_place() -> None:
+    across = np.array([np.cos(0.3), np.sin(0.3)])
+    reference = prepare_reference(scratched(0, 0.0, -50.0)[0], region=(40, 0, 384, 384))
+    image, body = scratched(1, 1.7, 150.0)
+    found = register(
+        reference,
+        image,
+        guess_px=1.9 * across,
+        guess_covariance=np.eye(2) * 0.25,
+        image_region=(40, 0, 384, 384),
+        takes_lines=True,
+    )
+    assert found.accepted and found.moving is not None, found.reason
+    shown = found.moving.draw((FAINT_SIZE, FAINT_SIZE)) > 0
+    inside = _x >= 50
+    assert shown[(body > 0.99) & inside].mean() > 0.7
+    assert shown[body < 0.01].mean() < 0.05
+
+
+def seen(
+    offset: np.ndarray, shown: np.ndarray, pixels: np.ndarray | float = 100.0, gain: float = 1.0
+) -> SpecimenSeen:
+    """Tiles with a structure of 30 each, of which ``shown`` (rows, cols) is seen, under noise of variance 1."""
+    ones = np.ones(offset.shape)
+    noise = TileNoise(1.0, gain**2, 1.0, 1.0)
+    return SpecimenSeen(offset, 30.0 * ones, 30.0 * gain * shown, pixels * ones, noise, 4.0, gain)
+
+
+HALF = np.tile(np.arange(12) < 5, (12, 1))
+
+
+@pytest.mark.parametrize("gain", [0.1, 1.0, 10.0])
+def test_a_body_is_missed_by_its_tiles_together_whatever_the_contrast(gain: float) -> None:
+    rng = np.random.default_rng(0)
+    offset = gain * (30.0 * HALF + rng.normal(0.0, 1.0, HALF.shape))
+    found = seen(offset, 1.0 - HALF, gain=gain)
+    assert found.find_gain() == pytest.approx(gain)
+    least = 0.6 * found.find_gain()
+    assert np.array_equal(found.find_missing(least, least), HALF)
+    # As bright, and it shows the specimen.
+    lit = seen(offset, np.ones(HALF.shape), gain=gain)
+    assert not np.any(lit.find_missing(least, least))
+
+
+def test_of_a_body_that_stands_apart_little_need_be_known() -> None:
+    """One tile in eight tells of the specimen. Under light that rises evenly, what shows less of it stays in."""
+    rng = np.random.default_rng(0)
+    body = np.zeros((12, 12), dtype=bool)
+    body[4:7, 4:7] = True
+    noise = rng.normal(0.0, 1.0, body.shape)
+    shown = 1.0 - 0.8 * body
+    standing = seen(30.0 * body + noise, shown)
+    assert standing.apart > 4.5
+    assert np.array_equal(standing.find_missing(0.2, 0.2), body)
+    rising = np.tile(np.linspace(-30.0, 30.0, 12), (12, 1)) + noise
+    even = seen(rising, np.where(rising > 0.0, 0.45, 1.0))
+    assert even.apart < 4.5
+    assert not np.any(even.find_missing(0.2, 0.2))
+
+
+def test_tiles_without_pixels_are_of_no_class() -> None:
+    rng = np.random.default_rng(0)
+    offset = np.where(HALF, 30.0, -30.0) + rng.normal(0.0, 1.0, HALF.shape)
+    pixels = np.full(HALF.shape, 100.0)
+    offset[-4:], pixels[-4:] = 0.0, 1.0
+    found = seen(offset, 1.0 - HALF, pixels)
+    assert found.apart > 30.0
+    missing = found.find_missing(0.6, 0.6)
+    assert np.array_equal(missing[:-4], HALF[:-4]) and not np.any(missing[-4:])
