@@ -20,8 +20,11 @@ import cv2
 import numpy as np
 import pytest
 
+from semcal_ros.core.drift.tracker import DriftTracker
 from semcal_ros.core.registration.agreement import MovingTiles, SpecimenSeen, TileNoise
+from semcal_ros.core.registration.illumination import measure_illumination
 from semcal_ros.core.registration.register import Registration, prepare_reference, register
+from semcal_ros.core.registration.tiles import Pyramid
 from tests.helpers.drift_scenes import Texture, noisy
 
 SIZE = 256
@@ -177,6 +180,37 @@ def test_a_faint_ground_that_is_lit_otherwise_is_no_body(contrast: float, level:
     assert found.accepted, found.reason
     assert found.moving is None
     assert np.all(np.abs(found.shift_px - shift) < 3.5 * np.sqrt(np.diag(found.covariance)))
+
+
+@pytest.mark.parametrize("level", [-60.0, 60.0])
+@pytest.mark.parametrize("contrast", [20.0])
+def test_what_covers_a_faint_ground_is_no_light(contrast: float, level: float) -> None:
+    for seed in range(3):
+        reference = prepare_reference(faint_ground(10 + seed, (0.0, 0.0), contrast))
+        image = faint_ground(20 + seed, (0.0, 0.0), contrast, level).astype(np.float32)
+        finest = reference.levels[-1]
+        noise = TileNoise.of(finest.sigma_px, reference.noise_variance, 22.0**2)
+        assert measure_illumination(finest, Pyramid(image), np.zeros(2), noise) is None
+
+
+@pytest.mark.parametrize("level", [-60.0, 60.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_beside_a_body_a_ground_is_followed_that_no_tile_shows_for_itself(
+    seed: int, level: float
+) -> None:
+    tracker, tracked, velocity = DriftTracker(), 0, np.array([0.3, -0.2])
+    for k in range(14):
+        view = GROUND.view(tuple(k * velocity), FAINT_SIZE)
+        body = (_x < 18.0 * (k - 2) - 0.2 * np.abs(_y - 190)).astype(np.float64)
+        body = cv2.GaussianBlur(body, (0, 0), 1.0)
+        drawn = (110.0 + 4.0 * view / view.std()) * (1.0 - body) + (110.0 + level) * body
+        noise = np.random.default_rng([seed, k]).normal(0.0, 22.0, drawn.shape)
+        update = tracker.update(drawn + noise, float(k))
+        off = np.abs(update.drift_px - k * velocity)
+        assert np.all((off < 0.1) | (off < 4.0 * update.sigma_px)), (k, off, update.sigma_px)
+        tracked += update.accepted
+    # Four, where only the tiles count that stand out one by one.
+    assert tracked >= 10
 
 
 def test_a_faint_ground_alone_has_no_body() -> None:
