@@ -278,6 +278,28 @@ def test_lines_at_equal_distances_are_refused_also_where_they_are_predicted() ->
             assert not found.accepted, (period, off, found.shift_px)
 
 
+@pytest.mark.parametrize(
+    ("reach", "off_px", "sigma_px"),
+    [
+        pytest.param(150.0, 0.2, 3.0, id="predicted too roughly"),
+        pytest.param(150.0, 3.5, 0.3, id="not predicted there"),
+        pytest.param(290.0, 0.2, 0.5, id="less than the body"),
+    ],
+)
+def test_across_lines_nothing_is_kept_that_the_prediction_does_not_tell(
+    reach: float, off_px: float, sigma_px: float
+) -> None:
+    across = np.array([np.cos(0.3), np.sin(0.3)])
+    found = register(
+        prepare_reference(scratched(0, 0.0, -50.0)[0]),
+        scratched(1, 1.7, reach)[0],
+        guess_px=(1.7 + off_px) * across,
+        guess_covariance=np.eye(2) * sigma_px**2,
+        takes_lines=True,
+    )
+    assert not found.accepted
+
+
 @pytest.mark.parametrize("part", [0.55, 0.7])
 def test_a_stage_that_moves_within_a_frame_of_lines_is_no_tool(part: float) -> None:
     across = np.array([np.cos(0.3), np.sin(0.3)])
