@@ -46,7 +46,7 @@ class _Setup:
 
 @dataclass(frozen=True)
 class _Problem:
-    starts: Array
+    points_of_views: tuple[slice, ...]
     observed_px: Array
     across: None = None
 
@@ -69,7 +69,8 @@ def estimated(rng: np.random.Generator, displaced, *, views: int = 12) -> float:
         residuals.append(left - taken @ (taken.T @ left))
         places.append(xy)
     setup = _Setup(tuple(_View(np.full(CORNERS, OWN_PX)) for _ in range(views)))
-    problem = _Problem(CORNERS * np.arange(views + 1), np.concatenate(places))
+    points = tuple(slice(v * CORNERS, (v + 1) * CORNERS) for v in range(views))
+    problem = _Problem(points, np.concatenate(places))
     result = _Result(np.concatenate(residuals))
     return estimate_shared_excess_px(setup, problem, result)  # type: ignore[arg-type]
 

@@ -26,7 +26,6 @@ corner is made as uncertain as independent ones would have to be for images to b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -91,11 +90,6 @@ class LineJitter:
         return out
 
 
-def _views(problem: Problem) -> Iterator[slice]:
-    for first, last in zip(problem.starts[:-1], problem.starts[1:], strict=True):
-        yield slice(int(first), int(last))
-
-
 def _lines(problem: Problem, part: slice) -> Indices:
     """Return the line of each corner of a view, from 0; pixel centres are at whole numbers."""
     line = np.round(problem.observed_px[part, 1]).astype(np.intp)
@@ -109,7 +103,7 @@ def estimate_jitter(problem: Problem, result: BundleResult) -> LineJitter:
     """
     product, pairs = np.zeros(LAG_MAX), np.zeros(LAG_MAX)
     squares, used = 0.0, 0.0
-    for part in _views(problem):
+    for part in problem.points_of_views:
         inlier = result.huber_weight[part] >= 1.0
         x = result.residuals_px[part, 0]
         if problem.across is not None:
@@ -169,7 +163,7 @@ def jitter_covariance(problem: Problem, result: BundleResult, jitter: LineJitter
     columns = corners.columns[:-1]
     meat = np.zeros((size, size))
     kernel = np.zeros((0, 0))
-    for v, part in enumerate(_views(problem)):
+    for v, part in enumerate(problem.points_of_views):
         xx, yx, _ = problem.whitening[part].T * np.sqrt(corners.huber_weight[part])
         rows = corners.rows[:, :-1, part]
         score = np.zeros((problem.layout.size, rows.shape[2]))
@@ -228,7 +222,7 @@ def estimate_shared_excess_px(setup: Setup, problem: Problem, result: BundleResu
     """
     if problem.across is not None:
         return 0.0
-    bends = [_bend(setup, problem, result, part) for part in _views(problem)]
+    bends = [_bend(setup, problem, result, part) for part in problem.points_of_views]
     pairs = [(a, b) for a, b in pairwise(bends) if a is not None and b is not None]
     if len(pairs) < SHARED_PAIRS_MIN:
         return 0.0

@@ -228,8 +228,7 @@ def right_way_up(
 
 def resolve_mirrored_tilts(problem: Problem, state: State) -> tuple[State, int]:
     """Fit the poses from both signs of the tilt; return the better ones and how many changed."""
-    pairs = zip(problem.starts[:-1], problem.starts[1:], strict=True)
-    middle = np.stack([problem.board_m[a:b].mean(axis=0) for a, b in pairs])
+    middle = np.stack([problem.board_m[own].mean(axis=0) for own in problem.points_of_views])
     rotations = mirrored_tilt(state.rotations)
     # Turning about the middle of the visible points keeps the view in place.
     moved = np.einsum("vij,vj->vi", state.rotations - rotations, middle)

@@ -237,8 +237,7 @@ def field_system(
     augmented[:, place[:, None], place] = np.swapaxes(priors, 1, 2) @ priors
     observed = np.r_[corners.columns[:-1], inner : inner + size, width - 1]
     one = field.at(float(setup.magnifications[0]))
-    for v, view in enumerate(setup.views):
-        part = slice(int(problem.starts[v]), int(problem.starts[v + 1]))
+    for v, (view, part) in enumerate(zip(setup.views, problem.points_of_views, strict=True)):
         rows = np.zeros((2, size, len(view.image_xy)))
         if of_grid:
             spline = one.basis(view.board_xy_m / (problem.unit_m[v] * setup.norm_px)).T
