@@ -520,13 +520,13 @@ def _register_across(
         spread,
         limits.min_competing_height,
     )
+    if isinstance(found, Rejection) and found.status is MatchFailure.AMBIGUOUS:
+        # Lines at equal distances agree with any multiple of these.
+        return Registration(unmeasured_alignment(), float("nan"), found)
     image_noise = estimate_noise_variance(_texture(gray, inside, limits))
     whole = None
     if not isinstance(found, Rejection):
         whole = look_at_whole(reference, found[1], image_noise)
-    elif found.status is MatchFailure.AMBIGUOUS:
-        # Lines at equal distances agree with any multiple of these.
-        return Registration(unmeasured_alignment(), float("nan"), found)
     kept = None
     if whole is None or not (whole.is_complete or are_edges(whole)):
         kept = keep_across(reference, pyramid, lines, guess, spread)

@@ -243,10 +243,10 @@ def keep_across(
     """What moves across lines as predicted, at the predicted place along them; None where the prediction is uncertain,
     too little does, or the stage may have moved within the image.
     """
-    level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
     predicted = float(lines.across @ spread @ lines.across)
     if not predicted <= WELL_PREDICTED_PX**2:
         return None
+    level, noise = reference.levels[-1], noise_beside_tools(reference, pyramid)
     judge = _Judge(reference, noise, None, guess, 0.0, looks_for_odd=False)
     first = judge.first(information_weights(level, noise))
     found = align_reweighted(level, pyramid, guess, first, judge, held=lines.along)
