@@ -79,6 +79,10 @@ KINDS = {
     "scale -0.5 %": ("m", -0.005, "scale"),
     "aspect +0.2 %": ("aspect", 0.002, "aspect"),
     "centre of distortion +15 px": ("ex", 15.0, "centre of distortion"),
+    # In half image widths: 3 px over 6 columns of 512, and 1 px of a cubic.
+    "settling +3 px": ("settling_2", 3.0 / 256.0, "settling"),
+    "coils +1 px": ("coil_x3", 1.0 / 256.0, "coils"),
+    "spiral +0.003": ("xi_s", 0.003, "spiral"),
 }
 CHECKS = 8
 # Known to the truth of the reference recordings, over their range.

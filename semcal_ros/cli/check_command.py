@@ -42,7 +42,12 @@ from semcal_ros.files.recordings import RecordedFiles
 from semcal_ros.workflows.check_and_update import CheckOptions, check_recording
 from semcal_ros.workflows.check_specimen import MovesCheck, SpecimenCheckOptions, check_specimen
 
-_UNITS = {"centre of distortion": ("px", 1.0, 2), "distortion": ("", 1.0, 6)}
+_UNITS = {
+    "centre of distortion": ("px", 1.0, 2),
+    **dict.fromkeys(("distortion", "spiral", "products and fifth order"), ("", 1.0, 6)),
+}
+# More make the table too wide; --json has them all.
+_VALUES_SHOWN_MAX = 3
 
 
 @click.command("check")
@@ -97,7 +102,7 @@ def command(
     else:
         click.echo(f"{calibration}: {done.result.verdict.value}")
         echo_check(done.result)
-        click.echo(_ADVICE[done.result.verdict])
+        click.echo(_advise(done.result))
         echo_notes(done.notes)
         echo_rejected(done.rejections)
     if done.result.verdict is not Verdict.VALID:
@@ -244,18 +249,27 @@ def describe_check(result: CalibrationCheck) -> dict[str, Any]:
     }
 
 
-_ADVICE = {
-    Verdict.VALID: "nothing to do: the views agree with the calibration within its uncertainty",
-    Verdict.DEGRADED: "renew it with `semcal update` and such views, or calibrate again",
-    Verdict.INVALID: "this is another microscope, grid or display width: check --config, --squares and "
-    "--display-width, else calibrate anew",
-}
+def _advise(result: CalibrationCheck) -> str:
+    if result.verdict is Verdict.VALID:
+        return "nothing to do: the views agree with the calibration within its uncertainty"
+    if result.verdict is Verdict.INVALID:
+        return (
+            "this is another microscope, grid or display width: check --config, --squares and --display-width, else "
+            "calibrate anew"
+        )
+    if result.not_renewable:
+        return (
+            f"calibrate anew: `semcal update` does not renew {' and '.join(result.not_renewable)}"
+        )
+    return "renew it with `semcal update` and such views, or calibrate again"
 
 
 def _format_values(change: Change) -> str:
     pairs = zip(change.values, change.sigmas, strict=True)
     if change.name in ("scale", "aspect", "skew"):
         return ", ".join(f"{100.0 * v:+.3f} +- {100.0 * s:.3f} %" for v, s in pairs)
+    if len(change.values) > _VALUES_SHOWN_MAX:
+        return f"{len(change.values)} amplitudes"
     unit, factor, digits = _UNITS[change.name]
     return ", ".join(
         f"{factor * v:+.{digits}f} +- {factor * s:.{digits}f} {unit}".strip() for v, s in pairs

@@ -450,7 +450,8 @@ class CalibrationServer(StreamNode):
         calibration, views, _ = self._compared()
         result = check_found(calibration, views, self.config)
         if result.verdict is not Verdict.VALID:
-            raise CalibrationError(result.summary, do="call ~/update, or calibrate anew")
+            others = "" if result.not_renewable else "call ~/update, or "
+            raise CalibrationError(result.summary, do=f"{others}calibrate anew")
         return result.summary
 
     def _update(self) -> str:

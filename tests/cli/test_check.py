@@ -59,7 +59,7 @@ def test_the_exit_status_is_the_verdict(folder: Path, capsys: pytest.CaptureFixt
     out = capsys.readouterr().out
     assert out.startswith(f"{folder / 'cal.yaml'}: valid\n")
     assert "6 views" in out
-    header, *rows = out.splitlines()[1:9]
+    header, *rows = out.splitlines()[1:13]
     assert "z  px at most  nm at most  probability" in header
     assert "times those expected" in rows[-1] and "other distortion" in rows[-2]
     with pytest.raises(SystemExit) as ended:

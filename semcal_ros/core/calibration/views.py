@@ -139,6 +139,19 @@ class GridView:
             excess_px=float(np.hypot(self.excess_px, sigma_px)),
         )
 
+    def add_line_noise(self, sigma_px: float) -> GridView:
+        """Return the view with corners that are more uncertain by ``sigma_px`` along x, as where lines of the raster
+        are shifted; ``sigma_px`` of each grows as in the mean over both axes.
+        """
+        spread = self.covariance_px2
+        if spread is None:
+            spread = self.sigma_px[:, None, None] ** 2 * np.eye(2)
+        return replace(
+            self,
+            sigma_px=np.hypot(self.sigma_px, np.sqrt(0.5) * sigma_px),
+            covariance_px2=spread + sigma_px**2 * np.diag([1.0, 0.0]),
+        )
+
     @property
     def own_variance_share(self) -> Array:
         """(n,) part of the variance of the observations that is not excess noise."""

@@ -88,7 +88,7 @@ def check(calibrated: CalibrationResult, views: list[GridView]) -> CalibrationCh
 def test_what_holds_is_valid_and_no_z_score_is_off(calibrated: CalibrationResult) -> None:
     checks = [check(calibrated, simulated(SEM.camera_at, CHECKED, 10 + k)) for k in range(4)]
     assert all(done.verdict is Verdict.VALID for done in checks)
-    # By chance one of 20 tests in 200 is this improbable.
+    # By chance one of 36 tests is this improbable once in 56.
     assert min(change.p_value for done in checks for change in done.tested) > 5e-4
     z = [done.scale_change / done.scale_sigma for done in checks]
     # The corners are as uncertain as they say, but for the lines that jitter.
@@ -150,6 +150,44 @@ def test_a_change_is_named_with_its_size(
     assert found.z_scores == tuple(np.divide(found.values, found.sigmas))
 
 
+@pytest.mark.parametrize(
+    ("name", "by"),
+    [
+        ("spiral", {"xi_s": 0.004}),
+        ("products and fifth order", {"xi_v": 0.002}),
+        ("products and fifth order", {"xi_w": 0.002}),
+        ("coils", {"coil_x3": 1.0 / 256.0}),
+        ("coils", {"coil_y2": 0.5 / 256.0}),
+        ("settling", {"settling_1": 3.0 / 256.0}),
+        ("settling", {"settling_3": 3.0 / 256.0}),
+        ("settling", {"settling_5": 1.0 / 256.0}),
+    ],
+)
+def test_what_no_update_renews_is_named_alone(
+    calibrated: CalibrationResult, name: str, by: dict[str, float]
+) -> None:
+    """When only :data:`CHANGES` up to the centre were tested, these passed for several of them, and a settling of 6
+    columns for none. Half a pixel of a product led the tilts astray, at four times the residuals.
+    """
+    done = check(calibrated, simulated(changed(**by), CHECKED, 30))
+    assert [change.name for change in done.changes] == [name]
+    assert done.verdict is Verdict.DEGRADED
+    assert done.not_renewable == (name,)
+    assert done.misfit < 1.5
+    (found,) = done.changes
+    names = groups_of_changes(calibrated.model)[name]
+    # Beyond the place of the last corners an amplitude stands for others, so that values are not asked one by one.
+    if name != "settling":
+        for value, sigma, parameter in zip(found.values, found.sigmas, names, strict=True):
+            assert abs(value - by.get(parameter, 0.0)) < 3.5 * sigma
+
+
+def test_lines_that_jitter_are_no_settling(calibrated: CalibrationResult) -> None:
+    """One of forty such checks: as long as the jitter did not count along x, settling and products had changed too."""
+    done = check(calibrated, simulated(changed(m=-0.004), CHECKED, 81))
+    assert [change.name for change in done.changes] == ["scale"]
+
+
 def test_two_changes_are_both_named(calibrated: CalibrationResult) -> None:
     done = check(calibrated, simulated(changed(m=0.02, aspect=0.003), CHECKED, 31))
     assert {change.name for change in done.changes} == {"scale", "aspect"}
@@ -181,19 +219,18 @@ def test_distortion_that_no_parameter_describes(calibrated: CalibrationResult) -
     assert 0.02 < done.shape.rms_px < 0.08
 
 
-def test_a_distortion_that_turns_is_not_taken_for_what_the_calibration_does_not_know(
+def test_a_pattern_is_not_taken_for_what_the_calibration_does_not_know(
     calibrated: CalibrationResult,
 ) -> None:
-    """Spiral distortion, for which no change is tested: the centre and others explain some of it.
+    """Columns that are bent by u v2 and rows that are not: the radial term and the coils explain some of it.
 
     A principal point that is known to several px moves the image as a pose does, and that is no uncertainty of its
     shape, also where distortion bends what a pose does.
     """
     middle, views = 0.5 * np.array(SEM.image_size), []
     for view in simulated(SEM.camera_at, CHECKED, 43) + simulated(SEM.camera_at, CHECKED, 44):
-        out = (view.image_xy - middle) / middle[0]
-        turned = out[:, ::-1] * [-1.0, 1.0] * np.sum(out**2, axis=1, keepdims=True)
-        views.append(replace(view, image_xy=view.image_xy + 1.0 * turned))
+        u, v = ((view.image_xy - middle) / middle[0]).T
+        views.append(replace(view, image_xy=view.image_xy + np.outer(u * v**2, [1.0, 0.0])))
     done = check(calibrated, views)
     assert done.shape.stated_px < 0.02
     assert done.shape.significant

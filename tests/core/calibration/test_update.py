@@ -196,6 +196,14 @@ def test_residuals_that_nothing_explains_are_warned_of_until_the_next_update(
     assert list(after.model.statistics["warnings"]) == old
 
 
+def test_what_a_few_views_do_not_renew_is_refused_by_its_name(
+    calibrated: CalibrationResult,
+) -> None:
+    """Taken for a change of the distortion, a settling of 48 columns was renewed to a camera that is 1.3 px off."""
+    with pytest.raises(CalibrationError, match=r"a change of settling.*; calibrate anew"):
+        update(calibrated, changed(settling_5=3.0 / 256.0), 60)
+
+
 def test_contradictions_and_impossible_ageing_are_refused(calibrated: CalibrationResult) -> None:
     with pytest.raises(CalibrationError, match=r"scale is \+2\d\.\d % off .*--squares"):
         update(calibrated, changed(m=0.25), 62)

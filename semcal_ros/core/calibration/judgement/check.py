@@ -37,6 +37,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import BundleResult
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
 from semcal_ros.core.calibration.judgement.revision import (
+    WATCHED,
     Revision,
     changing,
     free_sigmas,
@@ -56,6 +57,8 @@ from semcal_ros.core.calibration.judgement.thresholds import (
 from semcal_ros.core.calibration.stage import StageAxis
 from semcal_ros.core.calibration.views import GridView
 from semcal_ros.core.camera.calibration_model import CalibrationModel
+from semcal_ros.core.camera.distortion import LATE_TERMS
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, SETTLING
 from semcal_ros.core.wording import counted
 
 _GROUPS = {
@@ -64,15 +67,20 @@ _GROUPS = {
     "skew": ("skew",),
     "distortion": ("xi_r", "xi_t", "xi_u"),
     "centre of distortion": ("ex", "ey"),
+    "spiral": ("xi_s",),
+    "products and fifth order": LATE_TERMS,
+    "coils": ("coil_x2", "coil_x3", "coil_y2", "coil_y3"),
+    "settling": SCAN_NAMES[SETTLING],
 }
 #: The names under which changes are reported.
 CHANGES = tuple(_GROUPS)
+_RENEWABLE = CHANGES[:5]
 _TESTS = len(CHANGES) + 1
 
 
 def groups_of_changes(model: CalibrationModel) -> dict[str, tuple[str, ...]]:
     """Return the parameters of a calibration that are tested together, by each of :data:`CHANGES`."""
-    own = changing(model)
+    own = (*changing(model), *WATCHED)
     return {name: tuple(p for p in group if p in own) for name, group in _GROUPS.items()}
 
 
@@ -94,7 +102,7 @@ class Change:
         One of :data:`CHANGES`.
     values, sigmas
         Changes of its parameters (:func:`groups_of_changes`) with their 1-sigma, in the mean over the views: relative
-        for the scale, px for the centre.
+        for the scale, px for the centre, half image widths for coils and settling.
     chi2, p_value
         By how much it lowers chi-square, and how probable as much is without a change.
     largest_px, largest_m
@@ -188,6 +196,12 @@ class CalibrationCheck:
         A large one is no change of the camera but noise, blur or an uneven grid, and takes no part in the verdict.
         """
         return (self.misfit - 1.0) / MISFIT_SIGMA
+
+    @property
+    def not_renewable(self) -> tuple[str, ...]:
+        """What has changed that a few views do not tell at all magnifications, so that only a new calibration does."""
+        named = [change.name for change in self.changes if change.name not in _RENEWABLE]
+        return (*named, *["distortion that no parameter describes"] * self.shape.significant)
 
     @property
     def summary(self) -> str:
@@ -374,7 +388,7 @@ def _at_views(model: CalibrationModel, setup: Setup, name: str) -> Array:
 
 def _estimate_changes(revision: Revision) -> _Estimate:
     model, setup = revision.model, revision.setup
-    names, index = changing(model), np.r_[revision.gains]
+    names, index = revision.names, np.r_[revision.gains]
     is_free = revision.problem.prior_sigma[index] > HELD_SIGMA
     gains = [p for p, free in zip(gaining(model), is_free, strict=True) if free]
     own = np.r_[revision.changes, index[is_free]]

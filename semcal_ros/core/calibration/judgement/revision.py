@@ -57,6 +57,7 @@ from semcal_ros.core.calibration.start import (
     add_shared_unknowns,
     align_lattices,
     mark_untilted,
+    tempered,
     with_excess,
 )
 from semcal_ros.core.calibration.views import (
@@ -71,12 +72,16 @@ from semcal_ros.core.camera.calibration_model import (
     CalibrationModel,
     design_matrix,
 )
+from semcal_ros.core.camera.distortion import LATE_TERMS
 from semcal_ros.core.camera.projection import ALL_NAMES
 from semcal_ros.core.camera.records import FitRecord
+from semcal_ros.core.camera.scan_distortion import SCAN_NAMES, SETTLING
 from semcal_ros.core.errors import CalibrationError
 
 _CHANGING = ("scale", "aspect", "skew", "xi_r", "xi_t", "xi_u", "ex", "ey")
 _GAINS = ("xi_r", "xi_t", "xi_u")
+WATCHED = ("xi_s", *LATE_TERMS, "coil_x2", "coil_x3", "coil_y2", "coil_y3", *SCAN_NAMES[SETTLING])
+"""Parameters of which a few views may show a change, whether the calibration has a function for them or not."""
 
 
 def changing(model: CalibrationModel) -> tuple[str, ...]:
@@ -104,9 +109,11 @@ class Revision:
         The calibration before.
     setup
         The new views, with the residual field of the calibration taken out.
+    names
+        The parameters that may have changed by the same amount at all magnifications.
     problem, result
         The adjustment. Its unknowns are a 1, the principal components of the calibration's covariance in sigmas,
-        the height of the grid and the size of its squares, the changes of :func:`changing`, the relative changes of
+        the height of the grid and the size of its squares, the changes of ``names``, the relative changes of
         :func:`gaining`, and what all views share.
     covariance
         (K, K) of the unknowns, with what the jitter of lines adds.
@@ -116,6 +123,7 @@ class Revision:
 
     model: CalibrationModel
     setup: Setup
+    names: tuple[str, ...]
     problem: Problem
     result: BundleResult
     covariance: Array
@@ -128,9 +136,8 @@ class Revision:
 
     @property
     def changes(self) -> slice:
-        """Where the changes of :func:`changing` are among the unknowns."""
-        count = len(changing(self.model))
-        return slice(self.gains.start - count, self.gains.start)
+        """Where the changes of ``names`` are among the unknowns."""
+        return slice(self.gains.start - len(self.names), self.gains.start)
 
     @property
     def gains(self) -> slice:
@@ -141,8 +148,8 @@ class Revision:
 
 
 def free_sigmas(model: CalibrationModel, setup: Setup) -> dict[str, float]:
-    """Prior 1-sigma of changes of any size, by name."""
-    free = {name: setup.prior_of(name)[1] for name in changing(model)}
+    """Prior 1-sigma of changes of any size, of :func:`changing` and of what is :data:`WATCHED`."""
+    free = {name: setup.prior_of(name)[1] for name in (*changing(model), *WATCHED)}
     return free | {"scale": FREE_CHANGE}
 
 
@@ -275,7 +282,7 @@ def revise(
     setup
         The views, from :func:`make_setup`.
     sigmas
-        Prior 1-sigma of each change of :func:`changing`.
+        Prior 1-sigma of each change, by its parameter: of those of :func:`changing`, or of :data:`WATCHED` as well.
     gains
         That of the relative changes of :func:`gaining`; None: they change by the same amount everywhere.
 
@@ -290,54 +297,66 @@ def revise(
         height_sigma_m=_spread(model, setup).height_sigma_m,
     )
     spread = _spread(model, setup)
-    every = [
-        *(sigmas[name] for name in changing(model)),
-        *((gains or {}).get(name, 0.0) for name in gaining(model)),
-    ]
-    problem = _build(model, setup, spread, every)
+    relative = {name: (gains or {}).get(name, 0.0) for name in gaining(model)}
+    problem = _build(model, setup, spread, sigmas, relative)
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
-    result = adjust(problem, State(theta, poses.rotations, poses.translations_m))
+    state = State(theta, poses.rotations, poses.translations_m)
+    pairs = zip(setup.views, poses.residuals_px, strict=True)
+    start_px = max(estimate_excess_sigma_px([view], left_px, 6) for view, left_px in pairs)
+    if start_px > 0.0:
+        # As at the start of a calibration: believed to its own noise, what has changed leads the poses astray.
+        noisy = _build(model, tempered(setup, start_px), spread, sigmas, relative)
+        state = adjust(noisy, state).state
+    result = adjust(problem, state)
     own_px = median_sigma_px(setup.views)
     shared_px = estimate_shared_excess_px(setup, problem, result)
     if shared_px > 0.0:
         setup = with_excess(setup, shared_px)
-        problem = _build(model, setup, spread, every)
+        problem = _build(model, setup, spread, sigmas, relative)
         result = refine(problem, result.state)
     for _ in range(DRIFT_UPDATES if problem.effects is not None else 0):
         own = update_components(setup, problem, result)
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
-        problem = _build(model, setup, spread, every)
+        problem = _build(model, setup, spread, sigmas, relative)
         result = refine(problem, result.state)
     misfit = float(np.sqrt(residual_variance(problem, result)) * np.hypot(1.0, shared_px / own_px))
-    freedom = problem.layout.of_view.size * len(setup.views) + len(theta)
-    excess = estimate_excess_sigma_px(setup.views, result.residuals_px, freedom)
-    if excess > 0.0:
-        setup = with_excess(setup, excess)
-        problem = _build(model, setup, spread, every)
+    lines = estimate_jitter(problem, result)
+    views = setup.views
+    if lines.sigma_px > 0.0 and problem.across is None:
+        # All of it is along x, where settling and coils show, and the half of it at most in the mean over both axes.
+        views = tuple(view.add_line_noise(lines.sigma_px) for view in views)
+    freedom = problem.layout.of_view.size * len(views) + len(theta)
+    excess = estimate_excess_sigma_px(views, result.residuals_px, freedom)
+    if excess > 0.0 or views is not setup.views:
+        setup = with_excess(replace(setup, views=views), excess)
+        problem = _build(model, setup, spread, sigmas, relative)
         result = refine(problem, result.state)
-    jitter = jitter_covariance(problem, result, estimate_jitter(problem, result))
-    return Revision(model, setup, problem, result, result.covariance + jitter, misfit)
+    covariance = result.covariance + jitter_covariance(problem, result, lines)
+    return Revision(model, setup, tuple(sigmas), problem, result, covariance, misfit)
 
 
 def _build(
     model: CalibrationModel,
     setup: Setup,
     spread: VarianceComponents,
-    sigmas: Sequence[float],
+    sigmas: Mapping[str, float],
+    gains: Mapping[str, float],
 ) -> Problem:
-    """Make the adjustment: the camera as calibrated, then the changes of :func:`changing` and of :func:`gaining`, whose
-    prior ``sigmas`` are given, then what all views share.
+    """Make the adjustment: the camera as calibrated, then the changes by an amount and the relative ones, whose prior
+    1-sigma are given by their parameters, then what all views share.
     """
     problem = build_problem(setup, model.functions, setup.views, spread)
     designs, sigma = _camera_designs(model, setup)
-    changes = np.zeros((*designs.shape[:2], len(sigmas)))
-    by_amount = changing(model)
-    for column, name in enumerate((*by_amount, *gaining(model))):
-        row = ALL_FUNCTIONS.index(name)
-        is_relative = name == "scale" or column >= len(by_amount)
+    rows = [ALL_FUNCTIONS.index(name) for name in (*sigmas, *gains)]
+    if max(rows) >= designs.shape[1]:
+        missing = len(ALL_NAMES) - designs.shape[1]
+        designs = np.pad(designs, ((0, 0), (0, missing), (0, 0)))
+    changes = np.zeros((*designs.shape[:2], len(rows)))
+    for column, row in enumerate(rows):
+        is_relative = row == 0 or column >= len(sigmas)
         changes[:, row, column] = designs[:, row, 0] if is_relative else 1.0
-    free = np.maximum(sigmas, HELD_SIGMA)
+    free = np.maximum([*sigmas.values(), *gains.values()], HELD_SIGMA)
     cameras = np.concatenate([designs, changes], axis=2)
     mean = np.append(1.0, np.zeros(cameras.shape[2] - 1))
     shared = len(problem.shared)

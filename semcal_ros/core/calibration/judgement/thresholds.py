@@ -35,8 +35,8 @@ CHECK_FALSE_ALARMS = TABLE.defined(
     "With which a valid calibration is called degraded; each of the tests has its share.",
 )
 SIGN_FLIPS = TABLE.derived(
-    "SIGN_FLIPS", 20_000, "draws",
-    "Of the signs of the views: a chance at the limit of one test, 0.01 / 6, is then known to 1 / sqrt(33) = 17 %.",
+    "SIGN_FLIPS", 33_000, "draws",
+    "Of the signs of the views: a chance at the limit of one test, 0.01 / 10, is then known to 1 / sqrt(33) = 17 %.",
 )
 CHECK_CELLS = TABLE.measured(
     "CHECK_CELLS", 6, "cells",

@@ -124,17 +124,17 @@ def update_calibration(
             expected="the calibrated microscope, grid and display width",
             do="check --config, --squares and --display-width, else calibrate anew",
         )
-    if check.shape.significant:
+    if check.not_renewable:
         raise CalibrationError(
-            f"views with distortion of {check.shape.rms_px:.3f} px RMS that no parameter describes",
-            expected="a change of scale, aspect, skew or distortion",
+            f"views that show a change of {' and of '.join(check.not_renewable)}",
+            expected="at most a change of scale, aspect, skew, distortion, or centre of distortion",
             do="calibrate anew",
         )
     setup = make_setup(model, views, image_size, untilted, axis or StageAxis())
     free, groups = free_sigmas(model, setup), groups_of_changes(model)
     proven = {name for change in check.changes for name in groups[change.name]}
     aged = ageing_sigmas(model, ageing, image_size[0])
-    sigmas = {name: free[name] if name in proven else aged[name] for name in free}
+    sigmas = {name: free[name] if name in proven else own for name, own in aged.items()}
     revision = revise(model, setup, sigmas, gain_sigmas(model, setup, check.changes))
     rms_px = float(np.sqrt(np.mean(np.sum(revision.result.residuals_px**2, axis=1))))
     renewed = _apply(revision)
