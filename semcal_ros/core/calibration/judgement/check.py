@@ -47,6 +47,7 @@ from semcal_ros.core.calibration.judgement.revision import (
 )
 from semcal_ros.core.calibration.judgement.thresholds import (
     CELL_VIEWS_MIN,
+    CHANGE_ROUNDS,
     CHECK_CELLS,
     CHECK_FALSE_ALARMS,
     GAIN_MAX,
@@ -345,20 +346,23 @@ def _find_changes(
 ) -> tuple[Revision, _Estimate, list[Change]]:
     """Adjust to the views, and find what has changed.
 
+    Where every change is free, poses may go far along what views of a few tilts do not tell apart, and the equations
+    that lead back to no change are no longer linear. What is found there is therefore adjusted alone, and all else
+    tested at that place, until it is the same.
+
     A distortion that has changed may have done so in proportion to itself. As long as it has to be by the same amount
     at all magnifications, the rest is taken for a change of its centre.
     """
-    free = free_sigmas(model, setup)
-    revision = revise(model, setup, free)
-    estimate = _estimate_changes(revision)
-    found = _select(estimate)
-    gains = gain_sigmas(model, setup, found)
-    if gains:
-        other = revise(model, setup, free, gains)
-        estimate_of_other = _estimate_changes(other)
-        again = _select(estimate_of_other)
-        if gain_sigmas(model, setup, again):
-            return other, estimate_of_other, again
+    free, groups = free_sigmas(model, setup), groups_of_changes(model)
+    found = _select(_estimate_changes(revise(model, setup, free)))
+    for _ in range(CHANGE_ROUNDS):
+        names = {change.name for change in found}
+        held = {p for name, group in groups.items() if name not in names for p in group}
+        revision = revise(model, setup, free, gain_sigmas(model, setup, found), held)
+        estimate = _estimate_changes(revision)
+        found = _select(estimate)
+        if {change.name for change in found} == names:
+            break
     return revision, estimate, found
 
 
@@ -403,7 +407,7 @@ def _estimate_changes(revision: Revision) -> _Estimate:
         for column, p in enumerate(relative, start=len(parameters)):
             values[parameters.index(p), column] = np.mean(_at_views(model, setup, p))
         groups[name] = _Group(np.array(columns), sigmas[columns[len(parameters) :]], values)
-    return _Estimate(information, information @ revision.result.state.theta[own], groups)
+    return _Estimate(information, information @ revision.proposed[own], groups)
 
 
 def _test(estimate: _Estimate, given: Sequence[str], name: str) -> Change:
@@ -432,7 +436,7 @@ def _select(estimate: _Estimate) -> list[Change]:
     chosen: list[str] = []
     while len(chosen) < len(CHANGES):
         rest = [_test(estimate, chosen, name) for name in CHANGES if name not in chosen]
-        best = min(rest, key=lambda change: change.p_value)
+        best = min(rest, key=lambda change: (change.p_value, -change.chi2))
         if best.p_value >= CHECK_FALSE_ALARMS / _TESTS:
             break
         chosen.append(best.name)

@@ -21,12 +21,12 @@ magnifications share. Poses, visits, drift, the shape of the grid and the stage 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semcal_ros.core.arrays import Array
+from semcal_ros.core.arrays import Array, solve_scaled
 from semcal_ros.core.calibration.estimator.blocks import Problem, State
 from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     BundleResult,
@@ -48,7 +48,7 @@ from semcal_ros.core.calibration.estimator.problem import (
     initial_components,
     with_shared,
 )
-from semcal_ros.core.calibration.estimator.thresholds import HELD_SIGMA
+from semcal_ros.core.calibration.estimator.thresholds import DECREASE_MIN, HELD_SIGMA
 from semcal_ros.core.calibration.estimator.variance_components import update_components
 from semcal_ros.core.calibration.judgement.evaluate import fit_poses
 from semcal_ros.core.calibration.judgement.thresholds import DRIFT_UPDATES, FREE_CHANGE
@@ -133,6 +133,12 @@ class Revision:
     def components(self) -> slice:
         """Where the components of the calibration's covariance are among the unknowns."""
         return slice(1, 1 + len(self.model.coefficients))
+
+    @property
+    def proposed(self) -> Array:
+        """(K,) the unknowns after one more Gauss-Newton step, in which nothing is held."""
+        step = solve_scaled(*self.result.equations(self.problem))
+        return np.asarray(self.result.state.theta + step)
 
     @property
     def changes(self) -> slice:
@@ -272,6 +278,7 @@ def revise(
     setup: Setup,
     sigmas: Mapping[str, float],
     gains: Mapping[str, float] | None = None,
+    held: Collection[str] = (),
 ) -> Revision:
     """Adjust a calibration, and all that :func:`make_setup` leaves open, to views.
 
@@ -285,6 +292,9 @@ def revise(
         Prior 1-sigma of each change, by its parameter: of those of :func:`changing`, or of :data:`WATCHED` as well.
     gains
         That of the relative changes of :func:`gaining`; None: they change by the same amount everywhere.
+    held
+        Parameters of ``sigmas`` that are adjusted as if they had not changed. The covariance is that of all, and
+        :attr:`Revision.proposed` tells what they would be.
 
     Raises
     ------
@@ -298,27 +308,30 @@ def revise(
     )
     spread = _spread(model, setup)
     relative = {name: (gains or {}).get(name, 0.0) for name in gaining(model)}
-    problem = _build(model, setup, spread, sigmas, relative)
+    fitted = {name: 0.0 if name in held else sigma for name, sigma in sigmas.items()}
+    problem = _build(model, setup, spread, fitted, relative)
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
     state = State(theta, poses.rotations, poses.translations_m)
     pairs = zip(setup.views, poses.residuals_px, strict=True)
     start_px = max(estimate_excess_sigma_px([view], left_px, 6) for view, left_px in pairs)
-    if start_px > 0.0:
-        # As at the start of a calibration: believed to its own noise, what has changed leads the poses astray.
-        noisy = _build(model, tempered(setup, start_px), spread, sigmas, relative)
-        state = adjust(noisy, state).state
     result = adjust(problem, state)
+    if start_px > 0.0:
+        # As at the start of a calibration: believed to its own noise, what has changed may lead the poses astray.
+        noisy = _build(model, tempered(setup, start_px), spread, fitted, relative)
+        other = adjust(problem, adjust(noisy, state).state)
+        if other.cost < result.cost - DECREASE_MIN:
+            result = other
     own_px = median_sigma_px(setup.views)
     shared_px = estimate_shared_excess_px(setup, problem, result)
     if shared_px > 0.0:
         setup = with_excess(setup, shared_px)
-        problem = _build(model, setup, spread, sigmas, relative)
+        problem = _build(model, setup, spread, fitted, relative)
         result = refine(problem, result.state)
     for _ in range(DRIFT_UPDATES if problem.effects is not None else 0):
         own = update_components(setup, problem, result)
         spread = replace(spread, drift_sigma_px=own.drift_sigma_px, lattice_sigma=own.lattice_sigma)
-        problem = _build(model, setup, spread, sigmas, relative)
+        problem = _build(model, setup, spread, fitted, relative)
         result = refine(problem, result.state)
     misfit = float(np.sqrt(residual_variance(problem, result)) * np.hypot(1.0, shared_px / own_px))
     lines = estimate_jitter(problem, result)
@@ -330,8 +343,11 @@ def revise(
     excess = estimate_excess_sigma_px(views, result.residuals_px, freedom)
     if excess > 0.0 or views is not setup.views:
         setup = with_excess(replace(setup, views=views), excess)
-        problem = _build(model, setup, spread, sigmas, relative)
+        problem = _build(model, setup, spread, fitted, relative)
         result = refine(problem, result.state)
+    if held:
+        problem = _build(model, setup, spread, sigmas, relative)
+        result = refine(problem, result.state, max_iterations=0)
     covariance = result.covariance + jitter_covariance(problem, result, lines)
     return Revision(model, setup, tuple(sigmas), problem, result, covariance, misfit)
 

@@ -34,6 +34,10 @@ CHECK_FALSE_ALARMS = TABLE.defined(
     "CHECK_FALSE_ALARMS", 0.01, "chance",
     "With which a valid calibration is called degraded; each of the tests has its share.",
 )
+CHANGE_ROUNDS = TABLE.cost(
+    "CHANGE_ROUNDS", 4, "rounds",
+    "Of adjusting what has changed and testing the rest.",
+)
 SIGN_FLIPS = TABLE.derived(
     "SIGN_FLIPS", 33_000, "draws",
     "Of the signs of the views: a chance at the limit of one test, 0.01 / 10, is then known to 1 / sqrt(33) = 17 %.",
