@@ -33,6 +33,7 @@ from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.microscope import Exponential, Residual
 from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
+from tests.helpers.made_once import made_once
 
 pytestmark = pytest.mark.slow
 
@@ -88,7 +89,7 @@ def _model_error(result, microscope, magnifications=BETWEEN):
 
 @pytest.fixture(scope="module")
 def with_field():
-    return _calibrate(WAVY, "auto")
+    return made_once("wavy-with-field", lambda: _calibrate(WAVY, "auto"))
 
 
 @pytest.mark.parametrize(

@@ -103,9 +103,7 @@ def scale_notes(result):
     return [w for w in result.warnings if w.startswith("scale:")]
 
 
-@pytest.mark.parametrize(
-    "percent", long_but(lambda percent: percent in (0.0, 1.0), [0.0, 0.2, 1.0, 3.0])
-)
+@pytest.mark.parametrize("percent", long_but(lambda percent: percent == 1.0, [0.0, 0.2, 1.0, 3.0]))
 def test_cells_that_are_no_squares_are_said(percent):
     """Lithography makes 0.05 %; what is seen of the rest is in nm per pixel by half."""
     wider = np.array([1.0 + percent / 100.0, 1.0])
@@ -382,6 +380,7 @@ def test_a_fit_that_fails_with_the_stage_is_made_without_it(monkeypatch, is_cure
     assert not any(view.has_stage_tilt for view in result.views)
 
 
+@pytest.mark.long
 def test_a_stage_with_the_wrong_sign_makes_no_mirrored_microscope():
     """Tilts the other way round, and a beam that spreads upwards, explain the views as well as the truth does."""
     views = stage_views(

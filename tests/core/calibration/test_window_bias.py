@@ -212,6 +212,7 @@ def test_odd_views_have_no_bias() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_calibration_is_not_led_astray_by_the_bias() -> None:
     # One decay that the camera has, 2 px over 12 columns, and corners that are moved as dots are.
     own = replace(

@@ -213,6 +213,7 @@ def test_a_specimen_that_moves_at_a_zoom_is_found_by_the_next_frame(ratio: float
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_of_a_random_walk_frames_after_a_zoom_say_nothing_of_the_step_before_it() -> None:
     """Where the centre of the zoom is not known, the drift at the zoom is as it was predicted, for good: a smooth$
     drift would be told by the frames that follow.

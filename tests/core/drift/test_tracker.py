@@ -729,6 +729,7 @@ def _draw_pores(seed: int, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 140.0 - 90.0 * special.expit((7.5 - distance) / 0.8), periods[0]
 
 
+@pytest.mark.long
 def test_a_stage_that_moves_by_nearly_a_period_under_a_cross_hair_is_not_followed_wrongly() -> None:
     """The cross-hair was left out at the predicted shift alone, so that it was a defect of the lattice at any other,
     and the period next to the prediction was taken: 24 px wrong in the first frame of each of ten series.

@@ -27,6 +27,7 @@ from semcal_ros.core.registration.reference import RegistrationSettings
 from semcal_ros.core.registration.register import prepare_reference, register
 
 
+@pytest.mark.long
 def test_a_tool_that_was_there_from_the_start_is_left_out_where_the_specimen_is_known() -> None:
     frames, drift, _ = draw(KINDS["tool over sparse from the start"], 116, 10)
     settings = DriftSettings(registration=RegistrationSettings(follow=(0.6, 0.0, 1.0, 1.0)))

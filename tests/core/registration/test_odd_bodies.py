@@ -234,6 +234,7 @@ def test_a_tool_at_rest_from_the_first_frame_on_is_not_followed() -> None:
     assert update.moving is not None or update.fixed is not None
 
 
+@pytest.mark.long
 def test_a_tool_at_rest_over_particles_in_the_middle_is_not_followed() -> None:
     """They lie together, where those of a tool may; but they are inside the image, and many."""
     accepted, wrong, found = 0, 0, 0
