@@ -346,14 +346,21 @@ def _find_changes(
 ) -> tuple[Revision, _Estimate, list[Change]]:
     """Adjust to the views, and find what has changed.
 
-    Where every change is free, poses may go far along what views of a few tilts do not tell apart, and the equations
-    that lead back to no change are no longer linear. What is found there is therefore adjusted alone, and all else
-    tested at that place, until it is the same.
+    Each change is tested where nothing has changed. If one has, all together tell what it is. But where all are free,
+    poses may go far along what views of a few tilts do not tell apart, and the equations that lead back to no change
+    are no longer linear. What is found there is therefore adjusted alone, and all else tested at that place, until it
+    is the same.
 
     A distortion that has changed may have done so in proportion to itself. As long as it has to be by the same amount
     at all magnifications, the rest is taken for a change of its centre.
     """
     free, groups = free_sigmas(model, setup), groups_of_changes(model)
+    every = [p for group in groups.values() for p in group]
+    revision = revise(model, setup, free, held=every)
+    estimate = _estimate_changes(revision)
+    found = _select(estimate)
+    if not found:
+        return revision, estimate, found
     found = _select(_estimate_changes(revise(model, setup, free)))
     for _ in range(CHANGE_ROUNDS):
         names = {change.name for change in found}

@@ -308,7 +308,7 @@ def revise(
     )
     spread = _spread(model, setup)
     relative = {name: (gains or {}).get(name, 0.0) for name in gaining(model)}
-    fitted = {name: 0.0 if name in held else sigma for name, sigma in sigmas.items()}
+    fitted = {name: sigma for name, sigma in sigmas.items() if name not in held}
     problem = _build(model, setup, spread, fitted, relative)
     unknowns = problem.designs.shape[2] - len(setup.shared)
     theta = np.concatenate([[1.0], np.zeros(unknowns - 1), setup.shared_start()])
@@ -346,8 +346,14 @@ def revise(
         problem = _build(model, setup, spread, fitted, relative)
         result = refine(problem, result.state)
     if held:
+        # After the 1, the components, the height and the squares.
+        theta, first = result.state.theta, len(model.coefficients) + 3
+        changes = dict.fromkeys(sigmas, 0.0)
+        changes |= dict(zip(fitted, theta[first : first + len(fitted)], strict=True))
+        parts = theta[:first], [*changes.values()], theta[first + len(fitted) :]
+        theta = np.concatenate(parts)
         problem = _build(model, setup, spread, sigmas, relative)
-        result = refine(problem, result.state, max_iterations=0)
+        result = refine(problem, replace(result.state, theta=theta), max_iterations=0)
     covariance = result.covariance + jitter_covariance(problem, result, lines)
     return Revision(model, setup, tuple(sigmas), problem, result, covariance, misfit)
 
