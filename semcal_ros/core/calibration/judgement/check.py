@@ -75,7 +75,8 @@ _GROUPS = {
 }
 #: The names under which changes are reported.
 CHANGES = tuple(_GROUPS)
-_RENEWABLE = CHANGES[:5]
+_NOT_RENEWABLE = tuple(name for name, group in _GROUPS.items() if set(group) <= set(WATCHED))
+_UNDESCRIBED = "distortion that no parameter describes"
 _TESTS = len(CHANGES) + 1
 
 
@@ -201,14 +202,14 @@ class CalibrationCheck:
     @property
     def not_renewable(self) -> tuple[str, ...]:
         """What has changed that a few views do not tell at all magnifications, so that only a new calibration does."""
-        named = [change.name for change in self.changes if change.name not in _RENEWABLE]
-        return (*named, *["distortion that no parameter describes"] * self.shape.significant)
+        named = [change.name for change in self.changes if change.name in _NOT_RENEWABLE]
+        return (*named, *[_UNDESCRIBED] * self.shape.significant)
 
     @property
     def summary(self) -> str:
         """The verdict, what has changed, and how far nm per pixel is off, in one sentence."""
         named = [change.name for change in self.changes]
-        named += ["distortion that no parameter describes"] * self.shape.significant
+        named += [_UNDESCRIBED] * self.shape.significant
         changed = f" ({', '.join(named)})" if named else ""
         return (
             f"{self.verdict.value}{changed}: nm per px off by {-100.0 * self.scale_change:+.3f} "
@@ -355,8 +356,7 @@ def _find_changes(
     at all magnifications, the rest is taken for a change of its centre.
     """
     free, groups = free_sigmas(model, setup), groups_of_changes(model)
-    every = [p for group in groups.values() for p in group]
-    revision = revise(model, setup, free, held=every)
+    revision = revise(model, setup, free, held=free)
     estimate = _estimate_changes(revision)
     found = _select(estimate)
     if not found:
@@ -364,7 +364,7 @@ def _find_changes(
     found = _select(_estimate_changes(revise(model, setup, free)))
     for _ in range(CHANGE_ROUNDS):
         names = {change.name for change in found}
-        held = {p for name, group in groups.items() if name not in names for p in group}
+        held = free.keys() - {p for name in names for p in groups[name]}
         revision = revise(model, setup, free, gain_sigmas(model, setup, found), held)
         estimate = _estimate_changes(revision)
         found = _select(estimate)
