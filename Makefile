@@ -6,6 +6,8 @@ VENV_PYTHON := .venv/bin/python
 
 # A sourced ROS installation or another environment of wheels must not leak into this one.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH VIRTUAL_ENV
+# What a process has compiled the hundreds that tests start after it need not: half of a collection is that.
+unexport PYTHONDONTWRITEBYTECODE
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)
 unexport LD_LIBRARY_PATH

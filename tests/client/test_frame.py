@@ -77,6 +77,7 @@ def test_pixels_become_metres_and_come_back(height_m: float) -> None:
     )
 
 
+@pytest.mark.long
 def test_covariances_are_those_of_random_cameras() -> None:
     """Between 4000 of them, a variance scatters by 2 %."""
     rng = np.random.default_rng(0)

@@ -42,6 +42,7 @@ def case() -> Case:
     return Case("estimated", camera_at, corrected=True)
 
 
+@pytest.mark.long
 def test_a_skewed_stage_comes_to_where_an_estimated_calibration_has_the_goal(case: Case) -> None:
     plant = NAMED["10 % off, axes turned by 3 degrees"]
     outcome = run_plant(plant, case, SCOPE, seed=52, known_m=2.0 * KNOWN_M, frames=9)

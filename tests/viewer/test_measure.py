@@ -44,6 +44,7 @@ def test_both_pictures_give_the_length_on_the_specimen() -> None:
         assert found.y_m == pytest.approx(-23e-6, rel=1e-5)
 
 
+@pytest.mark.long
 def test_the_sigma_is_the_scatter_of_calibrations_like_this_one() -> None:
     """Cameras are drawn from the covariance; the same two raw pixels are measured with each."""
     covariance = np.diag([0.01 * CAMERA.m, 0.004, 0.003, 2, 2, 5, 0.01, 0.004, 1.5, 1.5]) ** 2

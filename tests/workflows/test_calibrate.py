@@ -456,6 +456,7 @@ def test_the_reference_recording_with_a_stage(reference_data, monkeypatch):
     assert done.notes == ()
 
 
+@pytest.mark.long
 def test_a_copy_of_a_picture_is_no_new_view(dots):
     frames, _, _ = dots
     again = [*frames, ("copy", frames[1][1].copy(), frames[1][2])]

@@ -84,6 +84,7 @@ def tell_process(_: int) -> int:
     return os.getpid()
 
 
+@pytest.mark.long
 def test_results_come_in_the_order_of_the_items_from_other_processes(cluster):
     with open_workers(cluster) as workers:
         assert workers.elsewhere
@@ -113,6 +114,7 @@ def tell_process_of_array(array: Any, _: int) -> int:
     return int(array.nbytes)
 
 
+@pytest.mark.long
 def test_large_items_are_limited_by_their_size(cluster, monkeypatch):
     monkeypatch.setattr(module, "_BYTES_UNDER_WAY", 2 << 20)
     taken = []
@@ -133,11 +135,13 @@ def test_arrays_are_counted_wherever_they_are():
     assert count_bytes([array, ("x", [array]), 5]) == 2 * array.nbytes
 
 
+@pytest.mark.long
 def test_an_error_of_the_work_is_raised_here(cluster):
     with open_workers(cluster) as workers, pytest.raises(InvalidValueError, match="no 7"):
         list(workers.starmap(refuse, [(7,)]))
 
 
+@pytest.mark.long
 def test_a_stack_is_the_same_to_the_last_bit(cluster, frames, monkeypatch):
     monkeypatch.setattr(stack_module, "_FRAMES_PER_PART", 2)
     here = stack(frames, config="virtual_sem")
@@ -147,6 +151,7 @@ def test_a_stack_is_the_same_to_the_last_bit(cluster, frames, monkeypatch):
     np.testing.assert_array_equal(here.image.standard_error, there.image.standard_error)
 
 
+@pytest.mark.long
 def test_rectified_frames_are_the_same_to_the_last_bit(cluster, frames):
     calibration = make_calibration()
     here = rectify(frames, calibration=calibration, config="virtual_sem")
@@ -232,6 +237,7 @@ def test_corners_are_the_same_to_the_last_bit(cluster):
         np.testing.assert_array_equal(a.detection.covariance_px2, b.detection.covariance_px2)
 
 
+@pytest.mark.long
 def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
     monkeypatch.setattr(semcal_ros, "__version__", "0.0.1")
     with (

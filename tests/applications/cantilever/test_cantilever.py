@@ -401,7 +401,7 @@ def random_series(seed, magnification, pushes):
     ("seed", "magnification"),
     [
         (14, 6450.0),
-        (82, 8890.0),
+        pytest.param(82, 8890.0, marks=pytest.mark.long),
         pytest.param(43, 6450.0, marks=pytest.mark.long),
         pytest.param(63, 6450.0, marks=pytest.mark.long),
     ],
@@ -589,6 +589,7 @@ def test_points_that_are_not_on_the_beam_are_refused(end_plan, end_images, base,
         measure_series(end_images[:1], [0.0], camera, end_plan.microscope.timing, settings)
 
 
+@pytest.mark.long
 def test_a_dark_beam_is_measured_as_its_negative(end_plan, end_images, end_found):
     negatives = [255 - image for image in end_images]
     bright, dark = end_found, measured(end_plan, images=negatives)[0]
@@ -655,6 +656,7 @@ def test_a_shape_that_the_beam_does_not_have_is_told_and_in_the_sigma(end_plan, 
     assert not any("--shape" in note for note in fitting.notes)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_end_in_view():
     plan = cantilever_plan(
@@ -719,6 +721,7 @@ def test_a_beam_seen_edge_on():
     assert frame.sigma_m < 8e-9
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_blurred_and_noisy_recording_knows_less():
     plan = cantilever_plan(

@@ -87,6 +87,7 @@ def test_the_apex_is_where_it_is_and_as_good_as_it_says(name):
     assert np.max(np.abs(deviations)) < 3.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_bright_rim_is_in_the_uncertainty():
     """The model of an edge has none: it pulls the apex outwards, and the farther the fit reaches, the more."""

@@ -183,6 +183,7 @@ def _mean_square_over_stated(poses, outliers):
     return np.mean(squares, axis=0)
 
 
+@pytest.mark.long
 def test_outliers_widen_the_covariance_as_much_as_they_scatter_the_estimate(poses):
     # Some unknowns hang on priors, of heights and of their own, which do not scatter here: clean corners are the
     # measure.

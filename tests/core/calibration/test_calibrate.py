@@ -164,6 +164,7 @@ def test_meaningless_magnifications_are_refused(joint, g):
         joint.model.at(g)
 
 
+@pytest.mark.long
 def test_what_the_views_cannot_determine_is_said():
     # At 10 000x the perspective within the field is nearly nothing.
     result = _calibrate("parallel", magnifications=[8000.0, 9000.0, 10000.0], views=2)

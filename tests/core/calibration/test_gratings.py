@@ -89,6 +89,7 @@ def test_three_directions_tell_both_axes_the_skew_and_the_distortion() -> None:
     assert not any("tilted" in finding.text for finding in done.result.findings)
 
 
+@pytest.mark.long
 def test_two_directions_leave_the_skew_to_its_prior_and_say_so() -> None:
     done = calibrated([view(3000.0, turn) for turn in (0.1, 0.1 + 0.5 * np.pi, 0.12)])
     said = [finding.text for finding in done.result.findings]

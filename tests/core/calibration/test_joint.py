@@ -73,6 +73,7 @@ def _padded(setup: Setup, fit: JointFit) -> tuple[Problem, State]:
     return replace(problem, prior_sigma=sigma), state
 
 
+@pytest.mark.long
 def test_the_covariance_holds_by_how_much_coefficients_that_were_left_out_would_move(
     setup: Setup, fit: JointFit
 ) -> None:
@@ -206,6 +207,7 @@ def test_the_misfit_of_a_start_is_the_distortion_that_a_plane_does_not_explain()
     assert 0.1 < sizes["jsm820"] < 3.0
 
 
+@pytest.mark.long
 def test_magnifications_that_agree_make_the_prior_of_changes_about_half_as_wide() -> None:
     at_500 = JSM.camera_at(500.0)
     views = grid_views(

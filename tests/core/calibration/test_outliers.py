@@ -85,6 +85,7 @@ def test_a_view_at_the_wrong_magnification_is_left_out(name, factor, wrong):
             np.testing.assert_allclose(result.model.at(g).m, clean.model.at(g).m, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_a_view_whose_own_grid_is_not_known_to_be_stretched_is_not_left_out_for_it(monkeypatch):
     """The spread of the grids may be large by chance, and fall without any one of the views."""
     views = seen_views("parallel", (1000.0, 2000.0, 4000.0))

@@ -122,6 +122,7 @@ def test_too_few_magnifications_and_hopeless_steps_are_refused():
             MethodOptions(pda_step=step)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_chosen_step_is_that_of_the_calibration():
     options = CalibrationOptions("pda", MethodOptions(pda_step="auto"))
@@ -134,6 +135,7 @@ def test_a_chosen_step_is_that_of_the_calibration():
     assert chosen["rms_px"] == pytest.approx(statistics["rms_px"], rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_lies_between_the_steps_takes_no_part():
     """Multiples of 3000 above 100 select 100, 3500, 6000 and 10 000: leaving out another one changes nothing."""

@@ -33,6 +33,7 @@ from semcal_ros.synthetic import preset
 from semcal_ros.synthetic.microscope import Exponential, Residual
 from semcal_ros.synthetic.stage import grid_views
 from tests.helpers.calibrations import BETWEEN, CALIBRATED, NOISE_PX, calibrated
+from tests.helpers.long_tests import long_but
 from tests.helpers.made_once import made_once
 
 pytestmark = pytest.mark.slow
@@ -177,6 +178,7 @@ def test_held_out_agrees_with_a_new_calibration(with_field):
     assert result.held_out_rms_px[g] == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.long
 def test_one_magnification_is_enough():
     spiral = preset("spiral")
     result = calibrated("spiral", magnifications=(1000.0,), views=8)
@@ -209,7 +211,7 @@ def test_predicted_errors_are_as_large_as_the_errors():
     assert 0.41 < np.sqrt(np.mean(np.square(scores))) < 1.66
 
 
-@pytest.mark.parametrize("once", [True, False], ids=["once", "always"])
+@pytest.mark.parametrize("once", long_but(lambda once: once, [True, False]))
 def test_views_that_rounding_makes_unsolvable_have_no_field(once, monkeypatch):
     calls = []
 

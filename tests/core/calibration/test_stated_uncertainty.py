@@ -102,6 +102,7 @@ def test_inside_the_range_nothing_is_added(rising: CalibrationModel) -> None:
         assert rising.at(g).pixel_size_sigma_m == pytest.approx((0.0, 0.0), abs=1e-30)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["jsm820", pytest.param("pincushion", marks=pytest.mark.long)])
 def test_beyond_the_range_the_truth_is_within_what_is_stated(name: str) -> None:

@@ -134,6 +134,7 @@ def lattice_spread(true: float, known: float, rng: np.random.Generator) -> float
     return float(sigma[0] / usual[0])
 
 
+@pytest.mark.long
 def test_lattices_of_which_many_views_say_little_keep_their_usual_spread() -> None:
     """Sixty views whose tilts leave a stretch uncertain by twelve usual spreads say five by chance."""
     rng = np.random.default_rng(1)
@@ -141,6 +142,7 @@ def test_lattices_of_which_many_views_say_little_keep_their_usual_spread() -> No
     assert np.mean(drawn < 2.0) > 0.95
 
 
+@pytest.mark.long
 def test_lattices_that_are_stretched_have_a_spread_that_is_found() -> None:
     rng = np.random.default_rng(2)
     drawn = np.array([lattice_spread(6.0, 3.0, rng) for _ in range(100)])

@@ -252,10 +252,8 @@ BRIGHT_EDGED = [
 @pytest.mark.parametrize(
     ("pitch", "length", "width"),
     [
-        # All shapes at one pitch, and the most slender and the stoutest arms at the others.
-        pytest.param(
-            *case, marks=() if case[0] == 40.0 or case[2] in (0.10, 0.18) else pytest.mark.long
-        )
+        # The most slender and the stoutest arms.
+        pytest.param(*case, marks=() if case[2] in (0.10, 0.18) else pytest.mark.long)
         for case in BRIGHT_EDGED
     ],
 )

@@ -106,7 +106,7 @@ def test_a_hole_or_a_deposit_with_more_contrast_than_the_lines_hides_no_others(s
 
 
 @pytest.mark.parametrize("period", [16.0, 30.0, 64.0])
-@pytest.mark.parametrize("turn", [0.3, 2.2])
+@pytest.mark.parametrize("turn", long_but(lambda turn: turn == 0.3, [0.3, 2.2]))
 def test_bright_edges_at_even_distances_are_not_taken_for_lines(period: float, turn: float) -> None:
     # Faces and gaps are of one width, and what tells them is a twentieth of the contrast of the edges.
     off, x, _ = phase_of_lines(384, period, turn)

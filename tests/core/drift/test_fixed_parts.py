@@ -124,6 +124,7 @@ def test_a_specimen_at_rest_is_not_what_stays(believed: tuple[float, float]) -> 
     assert find_fixed_parts(first, second, np.array(believed)) is None
 
 
+@pytest.mark.long
 def test_a_target_that_is_brought_to_rest_is_tracked() -> None:
     """The stage turns a target too fast to be followed, and stops: what stands still then is the specimen, although the
     drift that was predicted meanwhile says that it should have gone on.
@@ -144,6 +145,7 @@ def test_a_target_that_is_brought_to_rest_is_tracked() -> None:
     assert all(update.accepted for update in updates[-8:])
 
 
+@pytest.mark.long
 def test_no_frame_from_before_the_specimen_was_lost_is_compared_with() -> None:
     tracker = DriftTracker()
     for k in range(4):
@@ -229,6 +231,7 @@ def test_a_reference_is_kept_where_little_more_of_it_is_left_out(
     assert np.all(np.abs(kept.shift_px - fresh.shift_px) < 0.1 * sigma)
 
 
+@pytest.mark.long
 def test_contrast_of_a_mean_does_not_grow() -> None:
     frames, drift, _ = draw(KINDS["sparse"], 200)
     tracker = DriftTracker()

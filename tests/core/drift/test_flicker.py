@@ -83,12 +83,10 @@ def errors_in_sigmas(
     return both[0], both[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("density", "jitter"),
-    [
-        pytest.param((0.1, 0.1), (0.0, 0.0), marks=pytest.mark.long),
-        ((0.06, 0.12), (0.1, 0.3)),
-    ],
+    [((0.1, 0.1), (0.0, 0.0)), ((0.06, 0.12), (0.1, 0.3))],
 )
 def test_sigma_holds_with_flicker_and_jitter_in_both_axes(
     density: tuple[float, float], jitter: tuple[float, float]

@@ -140,6 +140,7 @@ def test_lines_at_equal_distances_are_refused() -> None:
     assert not found.accepted
 
 
+@pytest.mark.long
 def test_lines_are_refused_without_a_prediction_and_where_nobody_takes_them() -> None:
     frames, drift = scratched(24)
     reference, spread = prepare_reference(frames[0]), 9.0 * np.eye(2)

@@ -156,6 +156,7 @@ def test_a_wrong_angle_looks_like_drift():
     assert slopes[1] == pytest.approx([0.0, turned], abs=0.05 * turned)
 
 
+@pytest.mark.long
 def test_where_there_is_no_structure_the_sigma_is_large():
     """Two fifths of the rows are empty: what their columns and the other rows do not tell, nobody knows."""
     whole, drifts = surface(5), [wandering(np.random.default_rng(k)) for k in (1, 2)]

@@ -580,6 +580,7 @@ def test_what_may_be_smooth_or_a_walk_is_allowed_to_be_both() -> None:
     assert both.psd > smooth_drift.psd
 
 
+@pytest.mark.long
 def test_after_a_gap_in_a_random_walk_the_error_is_as_large_as_its_sigma() -> None:
     true = ProcessNoise(1.0 / 30.0, 1.0, walk_s2=30.0)
     scaled = []

@@ -78,6 +78,7 @@ def test_stripes_do_not_pull_the_drift(drawn: Drawn, stripes: Stripes) -> None:
     assert np.max(np.abs(scores[6:])) < 4.0
 
 
+@pytest.mark.long
 def test_noise_and_what_moves_are_no_stripes() -> None:
     """Neither texture, nor lines of the specimen itself, which move with it; nor a tool with an edge along columns."""
     wires = np.random.default_rng(5).normal(size=(2 * SIZE, 1))
@@ -160,7 +161,14 @@ def _pads(
     return np.clip(6.0 * rng.poisson(40.0 * light * picture), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize(("pitch", "count"), [(40.0, 15), (64.0, 6), (90.0, 6)])
+@pytest.mark.parametrize(
+    ("pitch", "count"),
+    [
+        pytest.param(40.0, 15, marks=pytest.mark.long),
+        (64.0, 6),
+        pytest.param(90.0, 6, marks=pytest.mark.long),
+    ],
+)
 def test_pads_along_the_rows_are_neither_stripes_nor_followed_by_whole_periods(
     pitch: float, count: int
 ) -> None:

@@ -29,6 +29,7 @@ from semcal_ros.core.camera.scan_timing import ScanTiming
 from semcal_ros.core.rectification.chebyshev_map import RawMap, SmoothMaps
 from semcal_ros.core.rectification.raw_positions import RasterDrift, raw_from_output
 from semcal_ros.core.rectification.rectifier import Rectifier
+from tests.helpers.long_tests import long_but
 
 SIZE = (512, 384)
 TIMING = ScanTiming(2.0, averages=2, flyback_fraction=0.1)
@@ -99,7 +100,7 @@ def test_the_settling_is_seen_in_the_first_columns() -> None:
     assert missed[:, 1].max() < 0.002
 
 
-@pytest.mark.parametrize("name", DRIFTS)
+@pytest.mark.parametrize("name", long_but(lambda name: name != "accelerated", DRIFTS))
 def test_a_residual_field_comes_on_top(name: str) -> None:
     zero = zero_field(SIZE, (100.0, 10000.0), 1)
     values = zero.coefficients.copy()

@@ -404,6 +404,7 @@ def draw_circuit(period: float, shift: Array, seed: int) -> Array:
     return picture
 
 
+@pytest.mark.long
 def test_vias_and_ends_tell_the_shift_of_lines_beside_bare_ground() -> None:
     refused = []
     for seed in range(8):

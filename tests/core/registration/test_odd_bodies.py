@@ -65,6 +65,7 @@ def test_a_tool_with_most_of_the_structure_is_the_odd_one_whichever_moves(moves:
     np.testing.assert_array_equal(find_odd_bodies(*_scores(parts, rng)).tiles, _mask(TOOL))
 
 
+@pytest.mark.long
 def test_where_all_move_alike_none_is_odd_but_by_chance() -> None:
     rng = np.random.default_rng(3)
     shift = np.array([0.3, -0.2])
@@ -253,6 +254,7 @@ def test_a_tool_at_rest_over_particles_in_the_middle_is_not_followed() -> None:
     assert wrong <= 1 and accepted >= 70 and found >= 2
 
 
+@pytest.mark.long
 def test_lines_that_end_beside_other_bodies_tell_no_shift_across_them() -> None:
     """The edges of a tool hold the shift across them at none, and few particles do not tell which of both it is."""
     tracker = DriftTracker()
@@ -263,6 +265,7 @@ def test_lines_that_end_beside_other_bodies_tell_no_shift_across_them() -> None:
         assert np.all((off < 0.1) | (off < 3.0 * update.sigma_px)), (k, off, update.sigma_px)
 
 
+@pytest.mark.long
 def test_a_ball_that_begins_to_roll_is_not_followed_for_its_structure() -> None:
     """It has more of it than eight particles, and lies still with them for ten frames."""
     tracker, accepted = DriftTracker(), 0

@@ -619,6 +619,7 @@ def test_a_faint_texture_is_told_by_many_pixels(electrons: float) -> None:
     assert np.mean(np.square(z)) < 2.5
 
 
+@pytest.mark.long
 def test_two_faint_textures_have_nothing_in_common() -> None:
     for seed in range(4):
         for electrons in (4.0, 12.0):

@@ -36,6 +36,7 @@ from semcal_ros.core.registration.tiles import (
     tile_sums,
     tile_window,
 )
+from tests.helpers.long_tests import long_but
 
 
 @pytest.mark.long
@@ -61,6 +62,7 @@ def test_few_particles_reach_the_bound_with_a_sigma_that_holds() -> None:
     assert float(np.mean(ratio)) < 2.2
 
 
+@pytest.mark.long
 def test_chance_at_high_frequencies_does_not_tell_the_smoothing_of_a_few_particles() -> None:
     """One particle of 4 px is in the part whose spectrum is measured, ten are above it; none has fine structure."""
     y, x = np.mgrid[:384, :384].astype(float)
@@ -85,6 +87,7 @@ def _discs(places: np.ndarray, rng: np.random.Generator, electrons: float = 60.0
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.long
 def test_bright_particles_on_black_are_followed_within_their_sigma() -> None:
     """More than nine tenths of the picture are black, and all of the noise is where the particles are."""
     scores = []
@@ -142,7 +145,7 @@ def test_what_noise_does_where_the_gradients_are(everywhere: bool) -> None:
 
 
 @pytest.mark.parametrize("jump", [(60.0, -44.0), (90.0, -60.0)])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", long_but(lambda seed: seed == 0, range(2)))
 def test_where_a_stage_has_taken_particles_away_from_under_a_tool_is_in_the_sigma(
     seed: int, jump: tuple[float, float]
 ) -> None:
@@ -169,6 +172,7 @@ def _holes(places: np.ndarray, radii: np.ndarray, rng: np.random.Generator) -> n
     return np.clip(np.rint(15.0 * rng.poisson(8.0 * signal)), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.long
 def test_holes_that_are_plain_to_see_at_few_electrons_are_followed() -> None:
     """Under the smoothing that is best for their edges, hardly a tile has more of a gradient than noise has."""
     tracked, scores = 0, []

@@ -99,8 +99,11 @@ class FieldSystem:
     excess: Array
     observations: Array
 
-    def assembled(self, keep: Mask, prior: Array) -> tuple[Array, Array]:
-        """Assemble the normal equations of theta and the field, which has precision ``prior``."""
+    def assembled(self, keep: Mask) -> tuple[Array, Array]:
+        """Assemble the normal equations of theta and the field from members in ``keep``.
+
+        The prior of theta is in them, that of the field is not.
+        """
         count, own_size, width = len(self.designs), self.designs.shape[1], self.right.shape[1]
         blocks, rights = np.zeros((count, width, width)), np.zeros((count, width))
         for v in np.flatnonzero(keep):
@@ -113,26 +116,25 @@ class FieldSystem:
         pairs = (self.weights[:, :, None] * self.weights[:, None, :]).reshape(count, -1)
         own = pairs.T @ blocks[:, own_size:, own_size:].reshape(count, -1)
         own = own.reshape(ng, ng, slice_size, slice_size).transpose(0, 2, 1, 3)
-        matrix = np.empty((size + len(prior), size + len(prior)))
+        matrix = np.empty((size + ng * slice_size, size + ng * slice_size))
         matrix[:size, :size] = (turned @ blocks[:, :own_size, :own_size] @ self.designs).sum(axis=0)
         matrix[np.diag_indices(size)] += self.theta_precision
         matrix[:size, size:] = cross.reshape(size, -1)
         matrix[size:, :size] = matrix[:size, size:].T
-        matrix[size:, size:] = own.reshape(len(prior), -1) + prior
+        matrix[size:, size:] = own.reshape(ng * slice_size, -1)
         camera = np.einsum("mpk,mp->k", self.designs, rights[:, :own_size])
         field = np.einsum("mg,ma->ga", self.weights, rights[:, own_size:]).ravel()
         return matrix, np.concatenate([camera + self.theta_precision * self.theta_mean, field])
 
     def solve(self, keep: Mask, prior: Array) -> Array:
         """Solve for theta followed by the coefficients of the field, from members in ``keep``."""
-        matrix, right = self.assembled(keep, prior)
-        scaled, scale = equilibrate(matrix)
-        return scale * cho_solve(_cholesky(scaled), scale * right)
+        matrix, right = self.assembled(keep)
+        return _solve_field(matrix, right, prior)
 
     def covariance(self, prior: Array) -> Array:
         """Return the covariance of the result of :meth:`solve` from all members."""
-        matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool), prior)
-        scaled, scale = equilibrate(matrix)
+        matrix, _ = self.assembled(np.ones(len(self.group), dtype=bool))
+        scaled, scale = equilibrate(_with_field_prior(matrix, prior))
         inverse = cho_solve(_cholesky(scaled), np.eye(len(scale)))
         return 0.5 * (inverse + inverse.T) * np.outer(scale, scale)
 
@@ -143,6 +145,19 @@ class FieldSystem:
         z = np.concatenate([self.designs @ solution[:size], slices], axis=1)[self.group]
         bent = (self.information @ z[:, :, None])[:, :, 0]
         return np.sum((0.5 * bent - self.right) * z, axis=1)
+
+
+def _with_field_prior(matrix: Array, prior: Array) -> Array:
+    """Return the equations of theta and the field with the precision ``prior`` of the field."""
+    out = matrix.copy()
+    out[-len(prior) :, -len(prior) :] += prior
+    return out
+
+
+def _solve_field(matrix: Array, right: Array, prior: Array) -> Array:
+    """Solve equations of theta and the field, which has the precision ``prior``."""
+    scaled, scale = equilibrate(_with_field_prior(matrix, prior))
+    return scale * cho_solve(_cholesky(scaled), scale * right)
 
 
 def _cholesky(scaled: Array) -> tuple[Array, bool]:
@@ -372,11 +387,14 @@ def choose_field(
 ) -> FieldChoice:
     """Choose the strength that predicts left-out members best, and whether to have a field."""
     folds = _folds(system)
+    rest = [system.assembled(~fold) for fold in folds]
 
     def held_out(strength_px: float) -> Array:
         prior = _prior(blank, strength_px, setup.norm_px)
-        costs = [system.costs(system.solve(~fold, prior))[fold] for fold in folds]
-        return np.concatenate(costs)
+        pairs = zip(folds, rest, strict=True)
+        return np.concatenate(
+            [system.costs(_solve_field(*own, prior))[fold] for fold, own in pairs]
+        )
 
     without = held_out(NO_STRENGTH_PX)
     relative = setup.image_size[0] / REFERENCE_WIDTH_PX
