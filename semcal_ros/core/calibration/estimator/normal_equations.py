@@ -124,27 +124,54 @@ def schur_complement(
     problem: Problem, state: State, normal: NormalEquations, damping: float
 ) -> Eliminated:
     """Eliminate the poses, then the visits."""
-    first, outer = problem.layout.visit.start, problem.layout.view.start
-    own, gradient, views = eliminate(normal.matrix, normal.right, outer, damping)
+    own, gradient, views, visits = eliminate_views(
+        problem, state, normal.matrix, normal.right, damping
+    )
+    group = problem.group if problem.effects is None else problem.effects.visit_group
     groups = len(problem.designs)
-    if problem.effects is None:
-        visits = Inner(np.zeros((0, 0, first)), np.zeros((0, 0)), np.zeros((0, 0, 0)))
-        group = problem.group
-    else:
-        group = problem.effects.visit_group
-        own = sum_by(problem.effects.visit, len(group), own)
-        gradient = sum_by(problem.effects.visit, len(group), gradient)
-        sigma = problem.effects.visit_sigmas
-        visit_columns = np.arange(first, outer)
-        own[:, visit_columns, visit_columns] += sigma**-2.0
-        gradient[:, first:] -= state.visits / sigma**2
-        own, gradient, visits = eliminate(own, gradient, first, damping)
     return Eliminated(
         information=sum_by(group, groups, own),
         gradient=sum_by(group, groups, gradient),
         views=views,
         visits=visits,
     )
+
+
+def eliminate_views(
+    problem: Problem, state: State, matrix: Array, right: Array, damping: float
+) -> tuple[Array, Array, Inner, Inner]:
+    """Eliminate the unknowns of views, which come last, then those of visits, which come before these.
+
+    Parameters
+    ----------
+    matrix, right
+        (V, k, k) and (V, k) normal equations of each view.
+    damping
+        Marquardt's damping of what is eliminated.
+
+    Returns
+    -------
+    The equations of the others, of each visit, or of each view where there are no visits; and the unknowns of views
+    and of visits.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If what is eliminated is not positive definite.
+    """
+    outer = matrix.shape[1] - problem.layout.of_view.size
+    own, gradient, views = eliminate(matrix, right, outer, damping)
+    if problem.effects is None:
+        none = Inner(np.zeros((0, 0, outer)), np.zeros((0, 0)), np.zeros((0, 0, 0)))
+        return own, gradient, views, none
+    sigma, count = problem.effects.visit_sigmas, len(problem.effects.visit_group)
+    own, gradient = (sum_by(problem.effects.visit, count, sums) for sums in (own, gradient))
+    first = outer - len(sigma)
+    visit_columns = np.arange(first, outer)
+    own[:, visit_columns, visit_columns] += sigma**-2.0
+    gradient[:, first:] -= state.visits / sigma**2
+    own, gradient, visits = eliminate(own, gradient, first, damping)
+    return own, gradient, views, visits
 
 
 def eliminate(

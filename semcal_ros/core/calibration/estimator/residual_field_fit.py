@@ -35,7 +35,7 @@ from semcal_ros.core.calibration.estimator.bundle_adjustment import (
     residual_variance,
     variance_factor,
 )
-from semcal_ros.core.calibration.estimator.normal_equations import eliminate, sum_by
+from semcal_ros.core.calibration.estimator.normal_equations import eliminate_views, sum_by
 from semcal_ros.core.calibration.estimator.problem import Setup
 from semcal_ros.core.calibration.estimator.residuals import (
     corner_rows,
@@ -322,24 +322,8 @@ def _without_poses_and_visits(
     matrix, right = augmented[:, order[:, None], order], augmented[:, order, -1]
     for damping in (0.0, ROUNDING_DAMPING):
         with suppress(np.linalg.LinAlgError):
-            return _eliminate(problem, state, matrix, right, damping)
+            return eliminate_views(problem, state, matrix, right, damping)[:2]
     raise _rounded("views")
-
-
-def _eliminate(
-    problem: Problem, state: State, matrix: Array, right: Array, damping: float
-) -> tuple[Array, Array]:
-    first = matrix.shape[1] - problem.layout.of_view.size
-    matrix, right, _ = eliminate(matrix, right, first, damping)
-    if problem.effects is None:
-        return matrix, right
-    sigma, count = problem.effects.visit_sigmas, len(problem.effects.visit_group)
-    matrix, right = (sum_by(problem.effects.visit, count, sums) for sums in (matrix, right))
-    own = np.arange(first - len(sigma), first)
-    matrix[:, own, own] += sigma**-2.0
-    right[:, own] -= state.visits / sigma**2
-    matrix, right, _ = eliminate(matrix, right, first - len(sigma), damping)
-    return matrix, right
 
 
 def _second_differences(count: int) -> Array:
