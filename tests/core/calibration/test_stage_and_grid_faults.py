@@ -103,7 +103,7 @@ def scale_notes(result):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("percent", [0.0, 0.2, 1.0, 3.0])
+@pytest.mark.parametrize("percent", [0.2, 1.0, 3.0])
 def test_cells_that_are_no_squares_are_said(percent):
     """Lithography makes 0.05 %; what is seen of the rest is in nm per pixel by half."""
     wider = np.array([1.0 + percent / 100.0, 1.0])
