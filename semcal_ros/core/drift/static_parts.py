@@ -33,7 +33,12 @@ from semcal_ros.core.drift.fixed_parts import (
 )
 from semcal_ros.core.drift.frame import ScanFrame
 from semcal_ros.core.drift.overlay import find_overlay, remove_overlay
-from semcal_ros.core.drift.stripes import Stripes, find_stripes, suspect_stripes
+from semcal_ros.core.drift.stripes import (
+    Stripes,
+    find_lone_lines,
+    find_stripes,
+    suspect_stripes,
+)
 from semcal_ros.core.drift.thresholds import (
     FIXED_EVERY_FRAMES_MAX,
     FIXED_FIRST,
@@ -185,14 +190,21 @@ class StaticParts:
         """The same, with stripes in all directions in which a frame, as it came, may have them: of ``least`` of its
         cells, where nothing is ``moving``.
         """
+        found = suspect_stripes(to_levels(image), self._hidden(image, moving), least)
+        return replace(self, stripes=self.stripes | found)
+
+    def find_lone_lines(self, image: AnyImage, moving: MovingTiles | None) -> Stripes:
+        """In which directions a frame, as it came, has lines through all of it, where nothing is ``moving``."""
+        return find_lone_lines(to_levels(image), self._hidden(image, moving))
+
+    def _hidden(self, image: AnyImage, moving: MovingTiles | None) -> Mask | None:
+        """(h, w) what of an image is not the specimen, or is ``moving``; None where all is and nothing does."""
         hidden = self._mask(image)
-        if moving is not None:
-            height, width = image.shape[:2]
-            tool = moving.grown().draw((width, height)) > 0
-            hidden = tool if hidden is None else hidden | tool
-        return replace(
-            self, stripes=self.stripes | suspect_stripes(to_levels(image), hidden, least)
-        )
+        if moving is None:
+            return hidden
+        height, width = image.shape[:2]
+        tool = moving.grown().draw((width, height)) > 0
+        return tool if hidden is None else hidden | tool
 
     def look_for_fixed(
         self, image: AnyImage, drift_px: Array, px_from_unit: Array

@@ -32,6 +32,7 @@ import numpy as np
 from semcal_ros.core.arrays import AnyImage, Array, Image, Mask
 from semcal_ros.core.drift.fixed_parts import look_beside
 from semcal_ros.core.drift.thresholds import (
+    LONE_LINE_AROUND,
     STRIPE_CELLS_MIN,
     STRIPE_CLIP,
     STRIPE_PARTS,
@@ -124,6 +125,26 @@ def suspect_stripes(
     return Stripes(*(_measure_common(*pair, least) is not None for pair in pairs))
 
 
+def find_lone_lines(image: Image, hidden: Mask | None = None) -> Stripes:
+    """In which directions an image (h, w) has a line through all of it that is brighter than those around it, or
+    darker: that of a cross-hair which was recorded with noise, or of a specimen.
+
+    It is so by :data:`STRIPE_CLIP` in each strip: by chance, none is. What is ``hidden`` (h, w) does not count.
+    """
+    seen = np.ones(image.shape, np.float32) if hidden is None else np.asarray(~hidden, np.float32)
+    return Stripes(_has_lone_line(image, seen), _has_lone_line(image.T, seen.T))
+
+
+def _has_lone_line(image: Image, seen: Image) -> bool:
+    profiles, is_seen = _unclipped_profile(image, seen, LONE_LINE_AROUND)
+    if profiles.shape[1] < STRIPE_PROFILE_MIN:
+        return False
+    limits = [_clip_limit(*pair) for pair in zip(profiles, is_seen, strict=True)]
+    signs = np.sign(profiles) * (np.abs(profiles) > np.array(limits)[:, None])
+    through = [np.all((signs == sign) | ~is_seen, axis=0) for sign in (-1.0, 1.0)]
+    return bool(np.any((through[0] | through[1]) & np.any(is_seen, axis=0)))
+
+
 def _has_stripes(left: Image, image: Image) -> bool:
     """Whether the lines of what a shift has ``left`` of an image share brightness that is no structure of it."""
     seen = np.ones(image.shape, np.float32)
@@ -161,24 +182,36 @@ def _measure_common(image: Image, seen: Image, least: float) -> Array | None:
 
 
 def _profile(image: Image, seen: Image) -> tuple[Array, Mask]:
+    """As :func:`_unclipped_profile`, without lines of something else."""
+    width = max(3, int(STRIPE_SHADING * len(image)) | 1)
+    profiles, is_seen = _unclipped_profile(image, seen, width)
+    for profile, has in zip(profiles, is_seen, strict=True):
+        limit = _clip_limit(profile, has)
+        np.clip(profile, -limit, limit, out=profile)
+    return profiles, is_seen
+
+
+def _unclipped_profile(image: Image, seen: Image, width: int) -> tuple[Array, Mask]:
     """(strips, lines) means of the lines of an image in strips beside each other, of what is ``seen`` (1, else 0) and
-    without what changes slowly; and where half of the line is seen. Elsewhere they are 0.
+    without the mean of ``width`` lines around; and where half of the line is seen. Elsewhere they are 0.
     """
     share = _average_strips(seen)
     # The mean of a small part is that of another place.
     is_seen = share >= 0.5
     means = _average_strips(np.asarray(image, dtype=np.float32) * seen) / np.maximum(share, 0.5)
-    width = max(3, int(STRIPE_SHADING * means.shape[1]) | 1)
     slow, count = (
         cv2.blur(np.asarray(each, np.float32), (width, 1), borderType=cv2.BORDER_REFLECT)
         for each in (means * is_seen, is_seen)
     )
     profiles = (means - slow / np.maximum(count, 0.5 / width)) * is_seen
-    for profile, has in zip(profiles, is_seen, strict=True):
-        if np.any(has):
-            limit = STRIPE_CLIP * 1.4826 * float(np.median(np.abs(profile[has])))
-            np.clip(profile, -limit, limit, out=profile)
     return profiles.astype(np.float64), is_seen
+
+
+def _clip_limit(profile: Array, is_seen: Mask) -> float:
+    """Beyond which the mean of a line is something else; infinite where none is seen."""
+    if not np.any(is_seen):
+        return np.inf
+    return STRIPE_CLIP * 1.4826 * float(np.median(np.abs(profile[is_seen])))
 
 
 def _average_strips(image: Image) -> Image:

@@ -1248,3 +1248,12 @@ STRIPE_CHI2_MIN = TABLE.derived(
     "STRIPE_CHI2_MIN", 25.0, "squared deviations",
     "Along one axis, between the shifts with and without stripes: by chance one in 1.7 million (normal, both sides).",
 )
+LONE_LINE_AROUND = TABLE.stated(
+    "LONE_LINE_AROUND", 9, "lines",
+    "With which one is compared: several times as many as a cross-hair is wide, in which a specimen hardly changes.",
+)
+LONE_LINE_CHI2_MIN = TABLE.derived(
+    "LONE_LINE_CHI2_MIN", 9.0, "squared deviations",
+    "The same where one line lies through all of the image, which is seldom a specimen: by chance one in 370 (normal, "
+    "both sides), and what its lines have in common is left out then.",
+)

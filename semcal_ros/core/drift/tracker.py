@@ -57,6 +57,7 @@ from semcal_ros.core.drift.stripes import Stripes
 from semcal_ros.core.drift.thresholds import (
     CANDIDATES,
     FIXED_PULL_MIN,
+    LONE_LINE_CHI2_MIN,
     PAUSE_MIN,
     STRIPE_CELLS_MIN,
     STRIPE_CELLS_TRIED,
@@ -284,9 +285,11 @@ def _follow_without_stripes(
         looks = rejection.status in STRIPE_FAILURES and state.rejected < STRIPE_TRIES
     # What was measured says by itself whether stripes make a difference.
     least = STRIPE_CELLS_MIN if rejection is not None else STRIPE_CELLS_TRIED
-    static = state.static
+    static, lone = state.static, Stripes()
     if looks:
+        lone = static.find_lone_lines(raw, with_them.moving)
         static = static.suspect_stripes(raw, with_them.moving, least)
+        static = replace(static, stripes=static.stripes | lone)
     if static.stripes == state.static.stripes:
         return found
     cleaned, frame = _without(setup, state, static, replace(found[2], image=raw))
@@ -306,7 +309,8 @@ def _follow_without_stripes(
         # No stripes pull that far: it is another match, such as one that is a period of the specimen away.
         return found
     squares = apart_px**2 / np.diag(to_px @ without.covariance[:2, :2] @ to_px.T)
-    pulled = Stripes(*(squares[::-1] > STRIPE_CHI2_MIN).tolist()) & static.stripes
+    limits = np.where([lone.lines, lone.columns], LONE_LINE_CHI2_MIN, STRIPE_CHI2_MIN)
+    pulled = Stripes(*(squares[::-1] > limits).tolist()) & static.stripes
     known = state.static.stripes
     if known | pulled == known:
         return found

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from semcal_ros.core.drift.estimates import DriftUpdate
-from semcal_ros.core.drift.stripes import Stripes, find_stripes, suspect_stripes
+from semcal_ros.core.drift.stripes import Stripes, find_lone_lines, find_stripes, suspect_stripes
 from semcal_ros.core.drift.thresholds import STRIPE_CELLS_TRIED
 from semcal_ros.core.drift.tracker import DriftTracker
 from tests.helpers.drift_scenes import Texture, noisy
@@ -60,9 +60,17 @@ def _own_lines(amplitude: float) -> Drawn:
     return lambda k: amplitude * np.random.default_rng(k).normal(size=(SIZE, 1)) + 0.0 * y
 
 
+def _cross_hair(amplitude: float) -> Drawn:
+    """As recorded from a screen, with the noise of the picture: one line and one column."""
+    lines = np.zeros((SIZE, SIZE))
+    lines[SIZE // 2], lines[:, SIZE // 2] = amplitude, amplitude
+    return lambda k: lines
+
+
 @pytest.mark.parametrize(
     ("drawn", "stripes"),
     [
+        pytest.param(_cross_hair(80.0), Stripes(lines=True, columns=True), id="cross-hair"),
         pytest.param(_hum(3.0, 8.5), Stripes(lines=True), id="hum"),
         pytest.param(_hum(8.0, 8.5, 0.13), Stripes(lines=True), id="hum that rolls"),
         pytest.param(lambda k: _hum(3.0, 8.5)(k).T, Stripes(columns=True), id="columns"),
@@ -94,6 +102,25 @@ def test_noise_and_what_moves_are_no_stripes() -> None:
     for drawn in (lambda _k: 0.0 * y, lines, tool):
         updates, _ = _track(drawn, frames=12)
         assert updates[-1].stripes == Stripes()
+
+
+def test_lone_lines_run_through_all_of_an_image() -> None:
+    rng = np.random.default_rng(4)
+    noise = [rng.normal(100.0, NOISE, (SIZE, SIZE)).astype(np.float32) for _ in range(50)]
+    assert not any(find_lone_lines(image) for image in noise)
+    (image, *_) = noise
+    half = image.copy()
+    half[100:102, : SIZE // 2] += 60.0
+    assert not find_lone_lines(half)
+    line = image.copy()
+    line[100:102, 40:-40] -= 60.0
+    assert find_lone_lines(line) == Stripes(lines=True)
+    assert find_lone_lines(line.T) == Stripes(columns=True)
+    # What hides it may be a tool.
+    hidden = np.zeros((SIZE, SIZE), dtype=bool)
+    hidden[90:110] = True
+    assert not find_lone_lines(line, hidden)
+    assert not find_lone_lines(line[:, :20].T)
 
 
 def test_few_images_of_noise_look_like_stripes() -> None:
