@@ -89,7 +89,9 @@ from semcal_ros.core.calibration.thresholds import (
     APART_RAD,
     DETERMINED_PART,
     IRREGULAR_RATIO,
+    NARROWEST_PART,
     NEARER_PART,
+    OUTSIDE_PART,
     REFUSED_PART,
     SCALE_FACTOR_TOLD,
     SUSPECTS_MAX,
@@ -155,7 +157,7 @@ def calibrate_views(
     Raises
     ------
     CalibrationError
-        If the views do not allow a calibration.
+        If the views do not allow a calibration, or cannot be views in images of this size.
     UnusableCalibrationError
         If their scale is off by more than a factor of 3 from the nominal one, or the adjustment
         did not converge.
@@ -244,7 +246,7 @@ def _prepare(
     priors: Priors | None,
 ) -> tuple[Setup, float]:
     """Return what is known before a fit, and the ratio of the observed to the nominal scale."""
-    ordered = _check_views(views, options)
+    ordered = _check_views(views, options, image_size)
     magnifications = np.unique([v.magnification for v in ordered])
     breaks = _check_breakpoints(options.breakpoints, magnifications)
     setup = Setup(ordered, magnifications, image_size, display_width_m, priors or Priors(), breaks)
@@ -342,8 +344,10 @@ def _find_open_directions(views: Sequence[GridView]) -> list[Finding]:
     return [Finding(text)]
 
 
-def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tuple[GridView, ...]:
-    """Return the views in the order of their magnifications, or raise if they are too few.
+def _check_views(
+    views: Sequence[GridView], options: CalibrationOptions, image_size: tuple[int, int]
+) -> tuple[GridView, ...]:
+    """Return the views in the order of their magnifications, or raise if they are too few or impossible.
 
     One is enough if its tilt is known.
     """
@@ -366,7 +370,29 @@ def _check_views(views: Sequence[GridView], options: CalibrationOptions) -> tupl
                 expected=f"at least {MINIMUM_CORNERS} in every view",
                 do="leave this view out",
             )
+        _refuse_impossible_corners(view, image_size)
     return tuple(sorted(views, key=lambda v: v.magnification))
+
+
+def _refuse_impossible_corners(view: GridView, image_size: tuple[int, int]) -> None:
+    """Refuse corners on one line of the grid, which tell no pose, and corners outside the images."""
+    sides = np.linalg.svd(view.board_xy_m - view.board_xy_m.mean(axis=0), compute_uv=False)
+    if view.across is None and sides[1] <= NARROWEST_PART * sides[0]:
+        raise CalibrationError(
+            f"{view.name} with corners on one line only",
+            expected="corners on several lines of the grid in every view",
+            do="leave this view out",
+        )
+    width, height = image_size
+    size = np.array(image_size)
+    low, high = view.image_xy.min(axis=0), view.image_xy.max(axis=0)
+    if np.any(low < -OUTSIDE_PART * size) or np.any(high > (1.0 + OUTSIDE_PART) * size):
+        raise CalibrationError(
+            f"{view.name} with corners from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) px, outside "
+            f"images of {width} x {height} px",
+            expected="corners in the images, in whose pixels they are stated",
+            do="state the width and the height of the images in which the corners were measured",
+        )
 
 
 def _units(setup: Setup) -> dict[str, Any]:

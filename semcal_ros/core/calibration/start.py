@@ -345,7 +345,9 @@ def tempered(setup: Setup, sigma_px: float) -> Setup:
     """Return the setup with observations, of corners and of the stage, that are believed less by the same factor."""
     noisy = with_excess(setup, sigma_px)
     own = np.concatenate([view.own_variance_share for view in noisy.views])
-    return replace(noisy, tempering=float(np.median(own)) ** -0.5)
+    # Of corners that state next to no noise, rounding leaves no share at all.
+    share = max(float(np.median(own)), float(np.finfo(np.float64).eps))
+    return replace(noisy, tempering=share**-0.5)
 
 
 def _fit_start(setup: Setup) -> tuple[Functions, State, VarianceComponents]:

@@ -158,6 +158,15 @@ NEARER_PART = TABLE.stated(
     "NEARER_PART", 0.3, "of the angle",
     "To the stage's tilts, that an axis the other way round leaves where it is the right one.",
 )
+NARROWEST_PART = TABLE.derived(
+    "NARROWEST_PART", 1e-6, "of the length",
+    "Width below which the corners of a view lie on one line of the grid: the rounding of single precision. Those of "
+    "two lines are apart by a thousandth and more of their length.",
+)
+OUTSIDE_PART = TABLE.stated(
+    "OUTSIDE_PART", 0.1, "of the image",
+    "By which no corner lies outside, not even a gross outlier: it was measured in images of another size.",
+)
 DETERMINED_PART = TABLE.stated(
     "DETERMINED_PART", 0.05, "of the largest singular value",
     "Below it, views of lines leave a linear distortion to its prior: where they run in two directions, within 3 "

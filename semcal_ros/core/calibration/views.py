@@ -98,8 +98,19 @@ class GridView:
                 f"view arrays of shapes {shapes}", expected="(n, 2), (n, 2), (n,)"
             )
         check_positive(self.magnification, "magnification")
-        if not (np.all(np.isfinite(self.image_xy)) and np.all(self.sigma_px > 0)):
-            raise InvalidValueError("a view with non-finite corners", expected="finite pixels")
+        for values, what, unit in (
+            (self.board_xy_m, "places on the grid", "metres"),
+            (self.image_xy, "corners", "pixels"),
+        ):
+            if not np.all(np.isfinite(values)):
+                raise InvalidValueError(
+                    f"a view with {what} that are not finite", expected=f"finite {unit}"
+                )
+        if not np.all((self.sigma_px > 0) & np.isfinite(self.sigma_px)):
+            raise InvalidValueError(
+                "a view with sigmas of corners that are not positive or not finite",
+                expected="finite numbers of pixels above 0; leave out what is not known",
+            )
         if self.covariance_px2 is not None and not _all_positive(self.covariance_px2, n):
             raise InvalidValueError(
                 f"covariances of shape {self.covariance_px2.shape}",

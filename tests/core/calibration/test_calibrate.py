@@ -188,6 +188,43 @@ def test_two_views_cannot_determine_scale_aspect_and_skew():
         _calibrate("jsm820", magnifications=[1000.0], views=2)
 
 
+def test_corners_that_cannot_be_those_of_a_view_are_refused():
+    microscope = preset("jsm820")
+    views = grid_views(microscope.camera_at, [1000.0], views=3)
+    sizes = {"image_size": microscope.image_size, "display_width_m": microscope.display_width_m}
+    row = np.isclose(views[1].board_xy_m[:, 1], np.median(views[1].board_xy_m[:, 1]))
+    assert np.count_nonzero(row) > 8
+    with pytest.raises(CalibrationError, match="with corners on one line only"):
+        calibrate_views([views[0], views[1].chosen(row), views[2]], **sizes)
+    with pytest.raises(CalibrationError, match="outside images of 256 x 512 px"):
+        calibrate_views(views, **{**sizes, "image_size": (256, 512)})
+    for name, value, match in (
+        ("board_xy_m", np.nan, "places on the grid that are not finite"),
+        ("image_xy", np.inf, "corners that are not finite"),
+        ("sigma_px", np.inf, "sigmas of corners"),
+        ("sigma_px", 0.0, "sigmas of corners"),
+    ):
+        values = getattr(views[0], name).copy()
+        values[3] = value
+        with pytest.raises(InvalidValueError, match=match):
+            replace(views[0], **{name: values})
+
+
+def test_corners_that_state_next_to_no_noise_are_calibrated():
+    microscope = preset("jsm820")
+    views = [
+        replace(view, sigma_px=np.full(len(view.sigma_px), 1e-9), covariance_px2=None)
+        for view in grid_views(microscope.camera_at, [800.0, 1600.0], views=3)
+    ]
+    result = calibrate_views(
+        views, image_size=microscope.image_size, display_width_m=microscope.display_width_m
+    )
+    for g in (800.0, 1600.0):
+        truth = microscope.camera_at(g).pixel_size_m
+        error = np.subtract(result.model.at(g).pixel_size_m, truth)
+        assert np.all(np.abs(error) < 3.0 * np.array(result.model.at(g).pixel_size_sigma_m))
+
+
 def test_a_camera_that_sees_nothing_of_a_view_is_a_calibration_error():
     microscope = preset("jsm820")
     views = grid_views(microscope.camera_at, [1000.0], views=2)
