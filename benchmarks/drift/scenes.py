@@ -408,6 +408,13 @@ def spots(frame: Frame, k: int, rng: Rng) -> Frame:
     return Frame(picture, frame.shown * (picture == frame.picture) * np.isnan(drawn), drawn)
 
 
+def grabbed(frame: Frame, k: int, rng: Rng) -> Frame:
+    """A cross-hair on a screen of which frames were grabbed: it has noise."""
+    picture = frame.picture.copy()
+    picture[SIZE // 2], picture[:, SIZE // 2] = 1.0, 1.0
+    return Frame(picture, frame.shown * (picture == frame.picture))
+
+
 def charging(frame: Frame, k: int, rng: Rng) -> Frame:
     y, x = np.mgrid[:SIZE, :SIZE] / SIZE
     return Frame(
@@ -518,6 +525,7 @@ KINDS: dict[str, Kind] = {
     "lines of their own": Kind(gold, own_lines),
     "columns over ridges": Kind(ridges, columns),
     "spots and cross-hair": Kind(gold, spots),
+    "grabbed cross-hair": Kind(gold, grabbed),
     "tool over sparse from the start": Kind(sparse, tool_from_start, determined=False),
     "scratches": Kind(scratches, determined=False),
     "tool over scratches": Kind(scratches, tool, determined=False),

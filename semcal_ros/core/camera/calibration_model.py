@@ -34,7 +34,7 @@ from semcal_ros.core.camera.projection import ALL_NAMES, PARAMETER_NAMES
 from semcal_ros.core.camera.records import FitRecord, LadderRecord, Provenance
 from semcal_ros.core.camera.residual_field import ResidualField
 from semcal_ros.core.camera.scan_camera import ScanCamera
-from semcal_ros.core.camera.thresholds import CONTRADICTION_SIGMAS
+from semcal_ros.core.camera.thresholds import CONTRADICTION_SIGMAS, USUAL_CHANGES
 from semcal_ros.core.errors import InvalidValueError
 
 #: What tells a camera: a grid, a specimen, or neither.
@@ -340,7 +340,8 @@ class CalibrationModel:
 
         The 1-sigma of a parameter is twice its variation over the calibrated range (highest minus
         lowest value), times the distance from the range in log g over the length of the range in
-        log g. A range shorter than a factor of e counts as one of a factor of e. So the sigma grows
+        log g. A range shorter than a factor of e counts as one of a factor of e, and tells the less of the variation,
+        the shorter it is: the rest is what is usual, :data:`USUAL_CHANGES`. So the sigma grows
         linearly from zero at the edge, and the variance with the square of the distance.
         """
         low, high = self.magnification_range
@@ -352,9 +353,18 @@ class CalibrationModel:
         sigma = np.zeros(len(_parameters_of(names)))
         for name in names:
             values = [self.functions[name](x) for x in grid]
-            sigma[ALL_FUNCTIONS.index(name)] = 2.0 * (max(values) - min(values)) * distance
+            seen = 2.0 * (max(values) - min(values))
+            unseen = (1.0 - float(np.log(high / low)) / span) * self._usual_change(name)
+            sigma[ALL_FUNCTIONS.index(name)] = np.hypot(seen, unseen) * distance
         sigma[0] *= self.nominal_px_per_m(g)
         return np.diag(sigma**2)
+
+    def _usual_change(self, name: str) -> float:
+        """By how much a function changes over a factor of e; those that are the same at all magnifications do not."""
+        if name in ("px", "py", "rho"):
+            return 0.0
+        change = USUAL_CHANGES.get(name, USUAL_CHANGES["xi_t"])
+        return 0.5 * self.image_width * change if name in ("ex", "ey") else change
 
 
 def pixel_size_gradient(model: CalibrationModel, magnification: float) -> Array:

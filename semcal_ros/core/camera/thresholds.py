@@ -53,6 +53,16 @@ CONDITION_TOLERANCE = TABLE.stated(
     "Makers' programs round what they show.",
 )
 
+# Beyond the calibrated range, in calibration_model.py
+
+USUAL_CHANGES = TABLE.stated(
+    "USUAL_CHANGES",
+    {"scale": 0.02, "aspect": 0.01, "skew": 0.002, "ex": 0.04, "ey": 0.04, "xi_r": 0.02, "xi_t": 0.005},
+    "of each function, of a half width for the centre",
+    "By how much one changes over a factor of e of the magnification where a calibration has seen no such factor: the "
+    "1-sigma of the fit's priors, over a decade and more. All other terms of lens and scan change as `xi_t` does.",
+)
+
 # Distortion by the lens, in distortion.py
 
 LENS_STEPS_MAX = TABLE.stated(

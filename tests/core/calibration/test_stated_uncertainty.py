@@ -96,6 +96,26 @@ def test_beyond_the_range_covariance_extrapolation_and_repeatability_add_as_vari
         assert sigma / size == pytest.approx(expected, rel=1e-9)
 
 
+def test_one_magnification_says_nothing_of_others(rising: CalibrationModel) -> None:
+    """Taken for a microscope that does not change, it was off by 51 stated sigmas at twice the magnification."""
+    constant = {
+        name: ContinuousFunction("linear_log", f.coefficients[:1], (LOW, LOW), np.array([LOW]))
+        for name, f in rising.functions.items()
+    }
+    size = sum(f.size for f in constant.values())
+    alone = replace(
+        rising, functions=constant, magnifications=(LOW,), covariance=np.zeros((size, size))
+    )
+    assert alone.extrapolation_sigma(LOW) == 0.0
+    near, far = (alone.extrapolation_sigma(g) for g in (1.1 * LOW, 2.0 * LOW))
+    assert far == pytest.approx(0.02 * np.log(2.0), rel=0.05)
+    assert far / near == pytest.approx(np.log(2.0) / np.log(1.1), rel=1e-6)
+    # The distortion as well: 2 % of the half width at its end.
+    camera = alone.at(np.e * LOW)
+    edge = camera.project_sigma(camera.sem_from_ideal(np.array([[camera.width - 1.0, camera.py]])))
+    assert np.max(edge) > 0.02 * 0.5 * camera.width
+
+
 def test_inside_the_range_nothing_is_added(rising: CalibrationModel) -> None:
     for g in (LOW, 700.0, HIGH):
         assert rising.extrapolation_sigma(g) == 0.0
