@@ -222,5 +222,5 @@ def test_views_are_checked():
         GridView(100.0, np.zeros((3, 2)), np.zeros((4, 2)), np.ones(3))
     with pytest.raises(ValueError, match="magnification"):
         GridView(0.0, np.zeros((3, 2)), np.zeros((3, 2)), np.ones(3))
-    with pytest.raises(ValueError, match="non-finite"):
+    with pytest.raises(ValueError, match="not finite"):
         GridView(10.0, np.zeros((3, 2)), np.full((3, 2), np.nan), np.ones(3))

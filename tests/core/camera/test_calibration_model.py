@@ -73,8 +73,10 @@ def test_a_range_shorter_than_a_factor_of_e_counts_as_one_of_that_length() -> No
     )
     camera = model.at(1100.0 * np.exp(0.5))
     sigma = np.sqrt(camera.covariance[0, 0]) / model.nominal_px_per_m(camera.magnification)
-    # Half of a factor of e away, with a variation of 0.02.
-    assert sigma == pytest.approx(2.0 * 0.02 * 0.5)
+    # Half of a factor of e away, with a variation of 0.02; and of four fifths of this factor nothing was seen, where
+    # 2 % are usual.
+    unseen = 0.02 * (1.0 - np.log(1100.0 / 900.0))
+    assert sigma == pytest.approx(0.5 * np.hypot(2.0 * 0.02, unseen))
 
 
 def test_within_the_range_nothing_is_added() -> None:
