@@ -210,7 +210,7 @@ def undistort_normalised(q_d: Array, xi_r: float, *others: float) -> Undistortio
     active = np.flatnonzero(branch)
     while active.size and iterations < LENS_STEPS_MAX:
         iterations += 1
-        f, jacobian, _ = distort_jacobians(q[active], xi_r, *others)
+        f, jacobian, _ = distort_jacobians(q[active], xi_r, *others, points_only=True)
         residual = q_d[active] - f
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         # Past the fold of the map (determinant <= 0) the root would be on the wrong sheet.

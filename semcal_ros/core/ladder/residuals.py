@@ -14,7 +14,7 @@
 
 """What is made small in a ladder: the distance between where a place is seen and where it should be.
 
-A place that picture i shows at the raw pixel u_i is found on the specimen by Newton's method, and projected into
+A place that picture i shows at the raw pixel u_i is found on the specimen, which is a plane, and projected into
 picture j; the residual is the pixel u_j at which it was found there minus that. Derivatives go through the analytic
 Jacobians of the camera, the place on the specimen as an implicit function: dx = -(du_i/dx)^-1 du_i/dq.
 
@@ -38,7 +38,7 @@ from semcal_ros.core.camera.projection import (
 from semcal_ros.core.camera.residual_field import FieldSlice
 from semcal_ros.core.camera.scan_camera import ScanCamera
 from semcal_ros.core.camera.scan_distortion import Raster
-from semcal_ros.core.ladder.thresholds import POSE_SIZE, SLOPE_STEPS, TIME_STEPS
+from semcal_ros.core.ladder.thresholds import POSE_SIZE, TIME_STEPS
 from semcal_ros.core.ladder.unknowns import LadderSetup, LadderState
 
 
@@ -199,9 +199,10 @@ def place_on_specimen(state: LadderState, picture: int, xy: Array, time: Array) 
     places = (flat - pixel * (pose[1:3] + time[:, None] * pose[3:5])) @ turn
     places = places - pixel * time[:, None] * state.drifts[picture]
     if np.any(state.slope):
-        for _ in range(SLOPE_STEPS):
-            seen = _see(state, picture, places, time)
-            places = places + np.linalg.solve(seen.by_place, (xy - seen.xy)[..., None])[..., 0]
+        # A point of height z is 1 + rho z times as far from the axis: z = slope . (place + rho z turn' flat).
+        from_axis = flat @ turn
+        height = places @ state.slope / (1.0 - camera.rho * (from_axis @ state.slope))
+        places = places + camera.rho * height[:, None] * from_axis
     return np.asarray(places)
 
 
@@ -215,11 +216,15 @@ def pair_values(state: LadderState, link: Link) -> Array:
 def _predict(state: LadderState, link: Link, places: Array) -> tuple[Array, Array]:
     """Pixels (n, 2) of the second picture where places are seen, and their times (n,)."""
     parameters, raster = state.parameters[link.second], Raster.of(*state.setup.image_size)
-    time = link.second_time
+    pose, time = state.poses[link.second], link.second_time
+    turn, _ = _turn(float(pose[0]))
+    # How much later a pixel is where the drift carries it in a frame, in pixels of the nominal size.
+    later = float((turn @ state.drifts[link.second] + pose[3:5]) @ link.time_slope)
     for _ in range(TIME_STEPS):
         xyz = _in_sem_frame(state, link.second, places, time)
         seen = project_points(parameters, xyz, raster)
-        before, time = time, link.second_time + (seen - link.second_xy) @ link.time_slope
+        reached = link.second_time + (seen - link.second_xy) @ link.time_slope
+        before, time = time, time + (reached - time) / (1.0 - later)
     return seen, before
 
 

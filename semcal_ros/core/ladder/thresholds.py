@@ -247,13 +247,10 @@ VISIT_SIGMA_MIN = TABLE.measured(
 # Residuals, in residuals.py
 
 TIME_STEPS = TABLE.derived(
-    "TIME_STEPS", 5, "steps",
-    "To the time of a pixel: where a drift is a tenth of the picture in a frame, which is the most, each leaves a "
-    "tenth of the way, and these 1e-5.",
-)
-SLOPE_STEPS = TABLE.derived(
-    "SLOPE_STEPS", 2, "steps",
-    "Newton's method converges quadratically, from a start that is exact without a slope.",
+    "TIME_STEPS", 3, "steps",
+    "To the time of a pixel, by Newton's method with pixels of the nominal size: where a drift is a tenth of the "
+    "picture in a frame, which is the most, and these are off by a tenth, each leaves a hundredth of the way, and the "
+    "two before the last 1e-4 of the few pixels by which a correspondence is off at the start.",
 )
 
 # Adjustment, in adjustment.py

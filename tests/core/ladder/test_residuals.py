@@ -109,6 +109,16 @@ def test_derivatives_are_those_of_the_residuals(terms: bool) -> None:
         )
 
 
+def test_a_place_on_a_slope_is_seen_where_it_was_found() -> None:
+    """A picture against itself: whatever the unknowns are, nothing is left."""
+    model = calibration_of(make_scope())
+    setup = make_setup(model, PICTURES, (SIZE, SIZE))
+    xy = np.random.default_rng(2).uniform(20.0, 236.0, (30, 2))
+    times = [(xy[:, 1] - 128.0) / SIZE] * 2
+    link = make_link(setup, (4, 4), xy, xy, np.broadcast_to(np.eye(2), (30, 2, 2)), times)
+    np.testing.assert_allclose(pair_values(_random_state(setup), link), 0.0, atol=1e-9)
+
+
 def test_the_start_has_the_cameras_of_the_end_of_the_grid_beyond_it() -> None:
     model = calibration_of(make_scope())
     setup = make_setup(model, PICTURES, (SIZE, SIZE))

@@ -50,7 +50,7 @@ def test_rates_are_those_of_the_distributions(chance: float, one_in: float) -> N
         (2.0**-16, 1.5e-5, 5e-7),
         (math.degrees(math.acos(t.ONE_ROTATION_COS)), 1.0, 0.01),
         (math.sqrt(2.0) * t.POINTED_SIGMA_PX / t.LENGTH_MIN_PX, 0.035, 5e-4),
-        (0.1**t.TIME_STEPS, 1e-5, 1e-9),
+        ((0.1 * 0.1) ** (t.TIME_STEPS - 1), 1e-4, 1e-8),
         (28 * t.CREEP_SIGMA, 0.03, 0.003),
         (math.degrees(t.STEEPEST_RAD), 5.0, 0.01),
     ],
