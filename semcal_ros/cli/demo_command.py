@@ -62,9 +62,11 @@ def command(options: DemoOptions) -> None:
     require_view()
     with needs_ros():
         from semcal_ros.nodes.demo import run_demo
+    from semcal_ros.viewer.server import refuse_taken_port
     from semcal_ros.workflows.calibrate import CalibrateOptions, calibrate_recording
     from semcal_ros.workflows.simulate import simulate
 
+    refuse_taken_port(options.port)
     with tempfile.TemporaryDirectory(prefix="semcal-demo-") as folder:
         bag, file = Path(folder) / "grid", Path(folder) / "calibration.yaml"
         with show_progress() as on_progress:

@@ -349,15 +349,7 @@ class PageServer:
         self.source = source
         self.local = host in LOCAL_HOSTS
         self.token = "" if self.local else token or secrets.token_urlsafe(16)
-        try:
-            self._sockets = _listen(host, port)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            raise InvalidValueError(
-                f"cannot listen on {host}:{port}: {reason}",
-                expected="an address of this computer and a free port",
-                do="give others by --host and --port; --port 0 takes a free one",
-            ) from error
+        self._sockets = _listen(host, port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._host = host
         self._pages: set[_Live] = set()
@@ -461,7 +453,31 @@ class PageServer:
             self.source.watch(len(self._pages))
 
 
+def refuse_taken_port(port: int, host: str = "localhost") -> None:
+    """Refuse what a :class:`PageServer` could not listen on, before any work is done for its page.
+
+    Raises
+    ------
+    InvalidValueError
+        The address cannot be used.
+    """
+    for one in _listen(host, port):
+        one.close()
+
+
 def _listen(host: str, port: int) -> list[socket.socket]:
+    try:
+        return _open_sockets(host, port)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InvalidValueError(
+            f"cannot listen on {host}:{port}: {reason}",
+            expected="an address of this computer and a free port",
+            do="give others by --host and --port; --port 0 takes a free one",
+        ) from error
+
+
+def _open_sockets(host: str, port: int) -> list[socket.socket]:
     """Listen on all addresses of a host, at the same port."""
     # tornado's own function leaves sockets open where one of the addresses is taken.
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)

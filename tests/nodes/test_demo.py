@@ -77,7 +77,6 @@ def test_one_command_shows_the_corrected_stream_and_ends_with_ctrl_c() -> None:
     assert not _nodes(mark)
 
 
-@pytest.mark.long
 def test_a_port_that_is_taken_is_refused_in_one_line() -> None:
     with socket.create_server(("localhost", 0)) as taken:
         port = taken.getsockname()[1]
