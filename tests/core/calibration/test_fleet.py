@@ -22,12 +22,9 @@ from benchmarks.calibration.fleet.score import judge
 from tests.helpers.long_tests import long_but
 
 # Seed and index. What each of them did before the fit started from corners that are as uncertain as the model: of
-# seed 1, 4, 11 and 18 have strong spirals, coils or settling, or a pivot 4 mm away; 5 ended with the pivot on the wrong
-# side, 3 left out sound views. Of seed 0, the drift that all views share ran away, and the aspect ratio with it.
-CASES = long_but(
-    lambda case: case == (1, 4),
-    ((1, 3), (1, 4), (1, 5), (1, 11), (1, 18), (0, 214)),
-)
+# seed 1, 4 has a strong spiral, and 5 ended with the pivot on the wrong side; of seed 0, the drift that all views share
+# ran away, and the aspect ratio with it.
+CASES = long_but(lambda case: case == (1, 4), ((1, 4), (1, 5), (0, 214)))
 
 
 @pytest.mark.slow
@@ -39,11 +36,10 @@ def test_a_random_microscope_is_calibrated_within_what_is_stated(case: tuple[int
     assert outcome.views_left_out == 0
 
 
-# One of 10 views, 30 % off, which makes a sound one look wrong; one of 96, which is a visit alone.
 @pytest.mark.long
-@pytest.mark.parametrize("index", [30, 42])
-def test_a_view_of_a_wrong_magnification_is_left_out_alone(index: int) -> None:
-    outcome, trace = judge(11, index, misstate=True)
+def test_a_view_of_a_wrong_magnification_is_left_out_alone() -> None:
+    """One of 10 views, 30 % off, which makes a sound one look wrong."""
+    outcome, trace = judge(11, 30, misstate=True)
     assert (outcome.raised, outcome.numpy_warnings) == ("", ()), trace
     assert outcome.verdict == "fine"
     assert outcome.has_found

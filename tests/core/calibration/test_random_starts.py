@@ -34,7 +34,7 @@ from semcal_ros.synthetic.stage import SimulatedStage, stage_views
 
 JSM = preset("jsm820")
 MAGNIFICATIONS = (200.0, 400.0, 800.0, 1600.0, 3200.0)
-STARTS = 6
+STARTS = 4
 
 
 def _views(readings: bool) -> list[GridView]:

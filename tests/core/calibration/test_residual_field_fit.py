@@ -111,7 +111,8 @@ def test_terms_describe_coils_settling_and_spiral_without_a_field(microscope, te
 
 @pytest.mark.long
 def test_auto_finds_what_no_term_describes(with_field):
-    without = _calibrate(WAVY, "off")
+    # What is missing is missing at every magnification.
+    without = _calibrate(WAVY, "off", CALIBRATED[::2])
     assert without.model.residual is None
     about = with_field.model.statistics["fit"]["residual_field"]
     assert about["worthwhile"] and about["converged"]
@@ -192,7 +193,7 @@ def test_predicted_errors_are_as_large_as_the_errors():
     """Differences of projected points, which no gauge changes, against their stated sigma."""
     scores = []
     strong = replace(preset("jsm820"), residual=Residual(spiral=0.003, sine=0.001))
-    for seed in range(4):
+    for seed in range(3):
         # From every other magnification: a field of that many is as certain as it says, too.
         result = _calibrate(strong, "on", CALIBRATED[::2], seed=seed)
         assert result.outliers == ()
@@ -207,8 +208,8 @@ def test_predicted_errors_are_as_large_as_the_errors():
             row = jacobian[4] - jacobian[:4].mean(axis=0)
             sigma = np.sqrt(np.einsum("ip,pq,iq->i", row, camera.joint_covariance, row))
             scores.extend(bend / sigma)
-    # The scores along each axis of a calibration are nearly one: a chi-square with 8 degrees of freedom, 99 % of it.
-    assert 0.41 < np.sqrt(np.mean(np.square(scores))) < 1.66
+    # The scores along each axis of a calibration are nearly one: a chi-square with 6 degrees of freedom, 99 % of it.
+    assert 0.33 < np.sqrt(np.mean(np.square(scores))) < 1.76
 
 
 @pytest.mark.parametrize("once", long_but(lambda once: once, [True, False]))

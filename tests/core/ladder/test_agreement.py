@@ -72,7 +72,6 @@ def _restated(
     ("flip", "name"),
     [
         (np.fliplr, "mirrored left to right"),
-        (np.flipud, "mirrored upside down"),
         (lambda image: image[::-1, ::-1], "turned by half a turn"),
     ],
 )
