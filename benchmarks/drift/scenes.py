@@ -346,6 +346,21 @@ def gripper(frame: Frame, k: int, rng: Rng) -> Frame:
     return _polygon(frame, base, 0.75)
 
 
+def closing_tips(frame: Frame, k: int, rng: Rng) -> Frame:
+    """Two slender tips in sight from the first frame on, which meet in the middle, rest there, and part again."""
+    gap, y = (
+        4.0 * max(FRAMES // 2 - 3 - k, 0) + 3.0 * max(k - FRAMES // 2 - 3, 0),
+        rng.uniform(140, 240),
+    )
+    for base, tip, wide in (
+        (-40.0, 0.5 * (SIZE - gap), 36.0),
+        (SIZE + 40.0, 0.5 * (SIZE + gap), 40.0),
+    ):
+        end = np.array([[base, y - wide], [tip, y - 5], [tip, y + 5], [base, y + wide]])
+        frame = _polygon(frame, end, 0.7, 0.02)
+    return frame
+
+
 def shadow(frame: Frame, k: int, rng: Rng) -> Frame:
     """Of a tool above, soft, over a third of the field."""
     x = 60.0 + 4.0 * k
@@ -512,6 +527,7 @@ KINDS: dict[str, Kind] = {
     "pushed particle": Kind(gold, pushed),
     "pushed over sparse": Kind(sparse, pushed),
     "gripper over sparse": Kind(sparse, gripper, electrons=15.0),
+    "tips that close over sparse": Kind(sparse, closing_tips),
     "tool at rest over few": Kind(few, tool_at_rest),
     "ball over few": Kind(few, rolling),
     "shadow": Kind(gold, shadow),

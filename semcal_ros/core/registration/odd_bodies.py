@@ -22,8 +22,8 @@ all others by more than those do among themselves.
 
 It fails where less than five bodies lie apart from each other, as on a continuous ground, and where as many move in one
 way as in the other. Where two bodies or more move otherwise than one that outweighs them, or are not seen where it is,
-it says that either may be the specimen, unless that one reaches from edge to edge. Those that tell nothing by
-themselves are witnesses together.
+it says that either may be the specimen; where that one reaches from edge to edge, as a ground does and two tools that
+meet, four and more all over the field. Those that tell nothing by themselves are witnesses together.
 """
 
 from __future__ import annotations
@@ -80,9 +80,12 @@ class _Bodies:
     numbers: NDArray[np.intp]
     labels: NDArray[np.int32]
 
-    def without(self, index: int) -> _Bodies:
-        kept = np.arange(len(self.numbers)) != index
+    def of(self, kept: Mask) -> _Bodies:
+        """Some of them (n,)."""
         return _Bodies(self.shifts[kept], self.covariances[kept], self.numbers[kept], self.labels)
+
+    def without(self, index: int) -> _Bodies:
+        return self.of(np.arange(len(self.numbers)) != index)
 
     def beside(self, others: _Bodies) -> _Bodies:
         """These and others, of other tiles."""
@@ -157,7 +160,8 @@ def find_odd_bodies(
         # Nearly always, all move alike. By one that outweighs the rest, each of the others is off.
         if np.all(_compare_alike(bodies) < limits):
             break
-        chi2 = np.array([_compare_one(bodies, k) for k in range(len(bodies.numbers))])
+        agreeing = _find_majority(bodies)
+        chi2 = np.array([_compare_one(bodies, agreeing, k) for k in range(len(bodies.numbers))])
         index = int(np.argmax(chi2 / limits))
         if chi2[index] < limits[index]:
             break
@@ -205,13 +209,18 @@ def _count_lost(structure: Mask, lost: Mask, information: Array) -> int:
 
 
 def _find_largest(bodies: _Bodies) -> int | None:
-    """The one of the bodies that outweighs all others and does not reach from edge to edge; None where none does."""
+    """The one of the bodies that outweighs all others; None where none does, or where it reaches from edge to edge and
+    the others are too few, or too close together, to be the specimen.
+    """
     if not len(bodies.numbers):
         return None
     index = int(np.argmax(bodies.precisions))
     if bodies.precisions[index] <= 0.5 * bodies.precisions.sum():
         return None
-    return None if _reaches_across(bodies.labels == bodies.numbers[index]) else index
+    if not _reaches_across(bodies.labels == bodies.numbers[index]):
+        return index
+    rest = bodies.without(index)
+    return index if len(rest.numbers) >= ODD_BODIES_LEFT_MIN and _are_spread(rest) else None
 
 
 def _is_in_doubt(bodies: _Bodies, index: int, missing: int, faint: int) -> bool:
@@ -334,11 +343,27 @@ def _compare_alike(bodies: _Bodies) -> Array:
     return np.asarray(np.einsum("ni,ni->n", apart, solved))
 
 
-def _compare_one(bodies: _Bodies, index: int) -> float:
-    """Squared distance of one body from the mean of all others, in units of what is expected of it if it moves as they
-    do, their scatter included.
+def _find_majority(bodies: _Bodies) -> Mask:
+    """(n,) the bodies that may have the shift of that with which most do, if these are more than half; else all.
+
+    Two tools that move apart would each hide behind the scatter that the other brings.
     """
-    others = bodies.without(index)
+    apart = bodies.shifts[:, None] - bodies.shifts
+    chi2 = np.einsum("mni,nij,mnj->mn", apart, np.linalg.inv(bodies.covariances), apart)
+    agree = chi2 < ODD_BODY_CHI2_MIN
+    counts = agree.sum(axis=1)
+    most = agree[np.argmax(counts)]
+    is_majority = 2 * counts.max() > len(counts) and counts.max() >= ODD_BODIES_LEFT_MIN
+    return most if is_majority else np.ones(len(counts), dtype=bool)
+
+
+def _compare_one(bodies: _Bodies, agreeing: Mask, index: int) -> float:
+    """Squared distance of one body from the mean of all others that agree, in units of what is expected of it if it
+    moves as they do, their scatter included.
+    """
+    kept = agreeing.copy()
+    kept[index] = False
+    others = bodies.of(kept)
     precisions = np.linalg.inv(others.covariances)
     information = precisions.sum(axis=0)
     weighted = np.einsum("nij,nj->ni", precisions, others.shifts)

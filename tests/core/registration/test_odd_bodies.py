@@ -78,11 +78,23 @@ def test_where_all_move_alike_none_is_odd_but_by_chance() -> None:
 def test_bodies_that_all_move_by_themselves_are_none_that_one_is_left_out_of() -> None:
     rng = np.random.default_rng(4)
     found = 0
-    for _ in range(100):
+    for _ in range(300):
         parts = [(_one(tile), rng.normal(0.0, 0.3, 2), 0.05) for tile in PARTICLES]
         found += bool(np.any(find_odd_bodies(*_scores(parts, rng)).tiles))
     # By noise alone, nearly each of these bodies would be one.
-    assert found <= 10
+    assert found <= 30
+
+
+def test_two_tools_that_move_apart_do_not_hide_each_other() -> None:
+    """Each of them is as far from the mean of all others as the scatter that the other one brings."""
+    rng, shift = np.random.default_rng(9), np.array([0.0, 0.6])
+    right = (slice(7, 11), slice(COLS - 7, COLS))
+    parts = [(TOOL, np.array([0.5, 0.0]), 0.1), (right, np.array([-0.5, 0.0]), 0.1)]
+    # One of a few particles is uncertain enough to agree with anything.
+    few = [(2, 20), (4, 12), (15, 3), (15, 19), (18, 9)]
+    parts += [(_one(tile), shift, 0.3 if tile == few[0] else 0.12) for tile in few]
+    both = _mask(TOOL) | _mask(right)
+    np.testing.assert_array_equal(find_odd_bodies(*_scores(parts, rng)).tiles, both)
 
 
 def test_a_particle_that_rolls_is_left_out_wherever_it_is() -> None:
@@ -117,16 +129,29 @@ def test_of_few_bodies_none_is_left_out() -> None:
 
 FLAKE = (slice(8, 12), slice(8, 15))
 GROUND = (slice(12, ROWS), slice(0, COLS))
+# Of two tools that meet.
+TIPS = (slice(8, 10), slice(0, COLS))
 
 
 @pytest.mark.parametrize(
     ("largest", "others", "in_doubt"),
-    [(TOOL, 3, True), (TOOL, 2, True), (TOOL, 1, False), (FLAKE, 2, True), (GROUND, 3, False)],
+    [
+        (TOOL, 3, True),
+        (TOOL, 2, True),
+        (TOOL, 1, False),
+        (FLAKE, 2, True),
+        (GROUND, 3, False),
+        (TIPS, 3, False),
+        (TIPS, 6, True),
+    ],
 )
 def test_where_few_bodies_move_otherwise_than_the_largest_either_may_be_the_specimen(
     largest: tuple[slice, slice], others: int, in_doubt: bool
 ) -> None:
-    """A ground from edge to edge is the specimen, and one particle beside a plate may be pushed."""
+    """A ground from edge to edge is the specimen, unless enough others, all over the field, move alike.
+
+    One particle beside a plate may be pushed.
+    """
     rng, still, shift = np.random.default_rng(8), np.zeros(2), np.array([1.4, 0.0])
     of_others = [(_one(tile), shift, 0.05) for tile in PARTICLES[:others]]
     found = find_odd_bodies(*_scores([(largest, still, 0.05), *of_others], rng))
