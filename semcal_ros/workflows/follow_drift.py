@@ -161,6 +161,17 @@ def estimate_timing(
     )
 
 
+def describe_untracked(path: DriftPath) -> list[str]:
+    """Say that the drift of more than half of the frames is predicted, where some of it is known at all."""
+    known = int(np.count_nonzero(path.accepted))
+    if not path.followed or 2 * known >= len(path):
+        return []
+    return [
+        f"only {known} of {counted(len(path), 'frame')} could be tracked: the drift of the others is predicted from "
+        "these, and the rate at the end may be, too; `status` in the table says why"
+    ]
+
+
 def describe_beginnings(path: DriftPath) -> list[str]:
     """Describe from which frames the drift is counted, where it is not the first one for all; frames count from 1."""
     notes = []

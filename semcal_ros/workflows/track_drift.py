@@ -42,6 +42,7 @@ from semcal_ros.workflows.follow_drift import (
     DriftFollower,
     camera_for,
     describe_beginnings,
+    describe_untracked,
     estimate_timing,
     start_time_s,
 )
@@ -220,7 +221,7 @@ def track_recording(source: Source, options: DriftOptions) -> DriftTrack:
             on_progress("smoothing", 0, None)
         notes = [*opened.notes, *([note] if note else [])]
     path = follower.path(live=live)
-    notes += describe_beginnings(path)
+    notes += [*describe_untracked(path), *describe_beginnings(path)]
     if path.turns:
         notes.append(_describe_similarity(path))
     if len(path) and path[-1].stripes:

@@ -30,7 +30,11 @@ from semcal_ros.config.config import load_config
 from semcal_ros.core.drift.estimates import DriftPath, DriftPredictor, DriftUpdate
 from semcal_ros.core.errors import Rejection
 from semcal_ros.core.registration.failures import MatchFailure
-from semcal_ros.workflows.follow_drift import describe_beginnings, estimate_timing
+from semcal_ros.workflows.follow_drift import (
+    describe_beginnings,
+    describe_untracked,
+    estimate_timing,
+)
 from semcal_ros.workflows.track_drift import DriftTrack
 from tests.helpers.drift_scenes import make_drift_update
 
@@ -109,6 +113,17 @@ def path_of(times: Sequence[float], refused: Sequence[int] = ()) -> DriftPath:
 )
 def test_from_which_frame_drift_is_counted_is_said(path: DriftPath, said: list[str]) -> None:
     assert describe_beginnings(path) == said
+
+
+def test_that_most_frames_were_not_tracked_is_said() -> None:
+    times = [float(k) for k in range(6)]
+    (said,) = describe_untracked(path_of(times, refused=[1, 2, 3, 5]))
+    assert said.startswith(
+        "only 2 of 6 frames could be tracked: the drift of the others is predicted"
+    )
+    assert describe_untracked(path_of(times, refused=[1, 2, 3])) == []
+    # That none was is another matter, and an error.
+    assert describe_untracked(path_of(times, refused=[1, 2, 3, 4, 5])) == []
 
 
 def test_where_tracking_began_again_is_said_with_what_is_known_of_it() -> None:
